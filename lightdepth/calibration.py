@@ -1,0 +1,93 @@
+"""Calibration files: camera.json and light.json."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+
+from lightdepth.camera import CameraModel, camera_from_params
+from lightdepth.errors import InputError
+from lightdepth.photometry import PhotometricCalibration
+
+
+def _pixel_center(value: float) -> float:
+    if value not in (0.0, 0.5):
+        raise ValueError("the centre of the first pixel is at 0.0 (OpenCV, SLAM exports) or 0.5 (COLMAP)")
+    return value
+
+
+class _CameraFile(BaseModel):
+    model_config = ConfigDict(extra="forbid", protected_namespaces=())
+    model: str
+    width: int
+    height: int
+    params: list[float]
+    pixel_center: Annotated[float, AfterValidator(_pixel_center)] = 0.5
+
+
+class _LightFile(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    gamma: float = 2.2
+    mu: float = 2.767
+    position_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    gain: float = 1.0
+    reflectance: float = 0.0
+    source: Literal["measured", "published", "assumed"] = "assumed"
+
+
+def read_json(path: Path) -> Any:
+    """Parsed JSON, with the file named in every error."""
+    try:
+        return json.loads(Path(path).read_text())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except ValueError as error:
+        raise InputError(f"{path}: not valid JSON ({error})") from error
+
+
+def _checked(schema: type[BaseModel], data: Any, where: str) -> Any:
+    try:
+        return schema.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or "the file"
+        raise InputError(f"{where}: {field}: {first['msg']}") from error
+
+
+def read_camera(path: Path) -> CameraModel:
+    """camera.json -> camera, brought to our pixel convention."""
+    found = _checked(_CameraFile, read_json(path), str(path))
+    camera = camera_from_params(found.model, found.width, found.height, found.params, str(path))
+    return camera.with_pixel_center(found.pixel_center)
+
+
+def write_camera(camera: CameraModel, path: Path) -> None:
+    data = {"model": camera.name, "width": camera.width, "height": camera.height, "params": list(camera.params)}
+    Path(path).write_text(json.dumps({**data, "pixel_center": 0.5}, indent=1) + "\n")
+
+
+def read_light(source: str | Path) -> PhotometricCalibration:
+    """A light.json file, or values written out as `gamma=2.2,mu=0`."""
+    text = str(source)
+    if "=" in text and not Path(text).exists():
+        where = f"--light {text}"
+        pairs = [[side.strip() for side in part.split("=", 1)] for part in text.split(",")]
+        if any(len(pair) != 2 for pair in pairs):
+            raise InputError(f"{where}: expected name=number pairs such as gamma=2.2,mu=0; vectors need a light.json")
+        data: Any = dict(pairs)
+    else:
+        where, data = text, read_json(Path(source))
+    values = _checked(_LightFile, data, where).model_dump()
+    try:
+        return PhotometricCalibration(**values)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def write_light(light: PhotometricCalibration, path: Path) -> None:
+    Path(path).write_text(json.dumps(asdict(light), indent=1) + "\n")

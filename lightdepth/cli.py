@@ -1,0 +1,112 @@
+"""The `lightdepth` command: finds its verbs through the entry points `lightdepth.commands`.
+
+A verb is a function. Its parameters become options (jsonargparse; dataclasses become dotted options), those without a
+default become positional; the first line of its docstring is its line in the help, read without importing the module.
+A verb with the single parameter `argv` parses its own arguments.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import sys
+from importlib import metadata, util
+from pathlib import Path
+from typing import Any
+
+GROUP = "lightdepth.commands"
+ORDER = ("demo", "doctor", "synth", "train", "predict", "sparse", "densify", "evaluate")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed."""
+    argv = sys.argv[1:] if argv is None else argv
+    commands = {entry.name: entry for entry in metadata.entry_points(group=GROUP)}
+    if not argv or argv[0] in ("-h", "--help"):
+        print(_help(commands))
+        return 0 if argv else 2
+    if argv[0] in ("-V", "--version"):
+        print(f"lightdepth {metadata.version('lightdepth')}")
+        return 0
+    verb, rest = argv[0], argv[1:]
+    if verb not in commands:
+        import difflib
+
+        close = difflib.get_close_matches(verb, commands, 1)
+        hint = f"; did you mean {close[0]}?" if close else f"; expected one of {', '.join(_sorted(commands))}"
+        print(f"lightdepth: no verb {verb!r}{hint}", file=sys.stderr)
+        return 2
+    from lightdepth.errors import InputError, PartialFailure
+
+    try:
+        function = commands[verb].load()
+        if list(inspect.signature(function).parameters) == ["argv"]:
+            return function(rest) or 0
+        return function(**_parse(function, verb, rest)) or 0
+    except InputError as error:
+        print(f"lightdepth {verb}: {error}", file=sys.stderr)
+        return 3
+    except PartialFailure as error:
+        print(f"lightdepth {verb}: {error}", file=sys.stderr)
+        return 4
+    except KeyboardInterrupt:
+        print(f"lightdepth {verb}: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
+    import jsonargparse
+
+    parser = jsonargparse.ArgumentParser(
+        prog=f"lightdepth {verb}", description=inspect.getdoc(function), default_env=False
+    )
+    parser.add_argument("--config", action="config", help="a YAML file with any of these options")
+    parameters = inspect.signature(function).parameters
+    # Declared here, because options derived from parameters have no short form and no bare flags.
+    if "output" in parameters:
+        default = parameters["output"].default
+        needed = default is inspect.Parameter.empty
+        parser.add_argument(
+            "-o",
+            "--output",
+            type=Path | None,
+            required=needed,
+            default=None if needed else default,
+            help="folder to make",
+        )
+    if "overwrite" in parameters:
+        parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run made there")
+    declared: set[str | int] = {name for name in ("output", "overwrite") if name in parameters}
+    parser.add_function_arguments(function, as_positional=True, sub_configs=True, skip=declared)
+    values = parser.instantiate_classes(parser.parse_args([_underscored(a) for a in argv]))
+    return {name: values[name] for name in parameters}
+
+
+def _underscored(argument: str) -> str:
+    """--mm-per-unit is --mm_per_unit."""
+    if not argument.startswith("--"):
+        return argument
+    name, sign, value = argument[2:].partition("=")
+    return f"--{name.replace('-', '_')}{sign}{value}"
+
+
+def _sorted(commands: dict[str, metadata.EntryPoint]) -> list[str]:
+    return sorted(commands, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name))
+
+
+def _help(commands: dict[str, metadata.EntryPoint]) -> str:
+    lines = ["usage: lightdepth VERB [options]     (lightdepth VERB --help shows a verb's options)", ""]
+    for name in _sorted(commands):
+        lines.append(f"  {name:<10} {_summary(commands[name])}")
+    return "\n".join([*lines, "", "lightdepth --version prints the version."])
+
+
+def _summary(entry: metadata.EntryPoint) -> str:
+    """First line of the verb's docstring, read from the source: importing it would cost seconds."""
+    spec = util.find_spec(entry.module)
+    if spec is None or spec.origin is None:
+        return ""
+    for node in ast.parse(Path(spec.origin).read_text()).body:
+        if isinstance(node, ast.FunctionDef) and node.name == entry.attr:
+            return (ast.get_docstring(node) or "").split("\n")[0]
+    return ""

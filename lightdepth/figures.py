@@ -1,0 +1,141 @@
+"""Pictures: arrays in, RGB images or PNG bytes out. No display is needed; meshes are drawn by ray casting."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from lightdepth import native
+
+GOOD, BAD, KEPT = (0, 200, 80), (235, 40, 40), (255, 170, 0)
+
+
+def png(image: np.ndarray) -> bytes:
+    """PNG of an RGB image (H, W, 3), uint8 or float in [0, 1]."""
+    if image.dtype != np.uint8:
+        image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    assert done
+    return data.tobytes()
+
+
+def thumbnail(image: np.ndarray, width: int) -> np.ndarray:
+    """An RGB image (H, W, 3) at another width, as uint8."""
+    if image.dtype != np.uint8:
+        image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def colored_distance(
+    distance: np.ndarray, valid: np.ndarray, near_far: tuple[float, float] | None = None
+) -> np.ndarray:
+    """Log distance as colours (H, W, 3) uint8: yellow near, violet far, black where invalid. The range is the valid
+    pixels' 1st to 99th percentile unless given."""
+    valid = valid & (distance > 0) & np.isfinite(distance)
+    if not valid.any():
+        return np.zeros((*distance.shape, 3), np.uint8)
+    log = np.log(np.where(valid, distance, 1))
+    low, high = np.log(near_far) if near_far else np.quantile(log[valid], (0.01, 0.99))
+    level = 255 * (1 - np.clip((log - low) / max(high - low, 1e-6), 0, 1))
+    colors = cv2.cvtColor(cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+    return np.where(valid[..., None], colors, 0).astype(np.uint8)
+
+
+def marked_points(
+    image: np.ndarray, groups: Sequence[tuple[np.ndarray, tuple[int, int, int]]], width: int = 480
+) -> np.ndarray:
+    """The image with dots at pixels (n, 2) of each group in its colour."""
+    small = thumbnail(image, width)
+    scale = width / image.shape[1]
+    for pixels, color in groups:
+        for u, v in pixels * scale:
+            cv2.circle(small, (round((u - 0.5) * 16), round((v - 0.5) * 16)), 2 * 16, color, -1, cv2.LINE_AA, shift=4)
+    return small
+
+
+def side_by_side(images: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
+    """Images of one height in a row, with white between them."""
+    height = min(image.shape[0] for image in images)
+    cells = []
+    for image in images:
+        if image.shape[0] != height:
+            image = cv2.resize(image, (round(image.shape[1] * height / image.shape[0]), height))
+        cells += [image, np.full((height, gap, 3), 255, np.uint8)]
+    return np.concatenate(cells[:-1], 1)
+
+
+def chart(size: tuple[float, float] = (6.4, 3.0)) -> tuple[Any, Any]:
+    """A matplotlib figure and axes that need no display."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def chart_png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def mesh_picture(
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    colors: np.ndarray,
+    size: tuple[int, int] = (640, 480),
+    origin: np.ndarray | None = None,
+    axes: np.ndarray | None = None,
+    focal: float = 0.6,
+) -> np.ndarray:
+    """A mesh (vertices (n, 3), triangles (m, 3), colors (n, 3) in [0, 1]) as an image (H, W, 3) uint8 on white.
+
+    From outside, obliquely, in parallel projection, unless `origin` (3,) and `axes` (3, 3; rows right, down, forward)
+    put a pinhole of focal length `focal` times the width at a place of their own.
+    """
+    width, height = size
+    if not len(triangles):
+        return np.full((height, width, 3), 255, np.uint8)
+    o3d = native.open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32)))
+    u, v = np.meshgrid((np.arange(width) + 0.5) / width - 0.5, ((np.arange(height) + 0.5) - height / 2) / width)
+    if origin is None or axes is None:
+        origins, directions = _outside(vertices, u, v, height / width)
+    else:
+        directions = np.stack([u / focal, v / focal, np.ones_like(u)], -1) @ axes
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        origins = np.broadcast_to(origin, directions.shape)
+    hit = scene.cast_rays(o3d.core.Tensor(np.concatenate([origins, directions], -1).astype(np.float32)))
+    met = np.isfinite(hit["t_hit"].numpy())
+    corners = triangles[hit["primitive_ids"].numpy()[met]]
+    weights = hit["primitive_uvs"].numpy()[met]
+    weights = np.concatenate([1 - weights.sum(-1, keepdims=True), weights], -1)
+    color = (colors[corners] * weights[..., None]).sum(1)
+    shade = 0.35 + 0.65 * np.abs((hit["primitive_normals"].numpy()[met] * directions[met]).sum(-1, keepdims=True))
+    picture = np.ones((height, width, 3))
+    picture[met] = np.clip(color * shade, 0, 1)
+    return np.rint(picture * 255).astype(np.uint8)
+
+
+def _outside(vertices: np.ndarray, u: np.ndarray, v: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Parallel rays onto the mesh's broad side, a little from above."""
+    middle = vertices.mean(0)
+    sample = vertices[:: max(1, len(vertices) // 20000)] - middle
+    long, across, thin = np.linalg.svd(sample, full_matrices=False)[2]
+    forward = thin + 0.45 * across
+    forward /= np.linalg.norm(forward)
+    right = long
+    down = np.cross(forward, right)
+    reach = np.abs(sample @ np.stack([right, down, forward]).T)
+    extent = 2.1 * max(np.quantile(reach[:, 0], 0.995), np.quantile(reach[:, 1], 0.995) / aspect)
+    origins = middle + extent * (u[..., None] * right + v[..., None] * down) - 2 * reach[:, 2].max() * forward
+    return origins, np.broadcast_to(forward, origins.shape)

@@ -1,0 +1,141 @@
+"""A calibrated image, and a batch of them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lightdepth.camera import CameraModel
+from lightdepth.errors import InputError
+from lightdepth.photometry import LightTerms, PhotometricCalibration
+
+
+def frame_number(name: str) -> int:
+    """The integer by which a frame and a map's keyframe meet: the last run of digits in the file's stem.
+
+    C3VD's `0012_color` and `12_color` are both 12. Raises InputError when there is none.
+    """
+    stem = name.replace("\\", "/").rsplit("/", 1)[-1]
+    stem = re.sub(r"\.[A-Za-z]\w*$", "", stem)
+    digits = re.findall(r"\d+", stem)
+    if not digits:
+        raise InputError(f"{name}: no number in the name; frames are matched with map entries by the integer in it")
+    return int(digits[-1])
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One calibrated image and the truth about it, where there is any.
+
+    image (H, W, 3) float32 RGB in [0, 1] as the camera encoded it; mask (H, W) bool, True where the image shows tissue;
+    true_distance (H, W) float32 [mm] along the ray with 0 where unknown, or None;
+    true_world_from_cam (4, 4) [mm], or None; time [s].
+    """
+
+    name: str
+    image: np.ndarray
+    camera: CameraModel
+    light: PhotometricCalibration = field(default_factory=PhotometricCalibration)
+    mask: np.ndarray | None = None
+    time: float | None = None
+    true_distance: np.ndarray | None = None
+    true_world_from_cam: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        height, width = self.image.shape[:2]
+        if self.image.ndim != 3 or self.image.shape[2] != 3:
+            raise InputError(f"{self.name}: image of shape {self.image.shape}; expected (H, W, 3)")
+        check_image_size(self.name, width, height, self.camera)
+        for what, array in (("mask", self.mask), ("true distance", self.true_distance)):
+            if array is not None and array.shape != (height, width):
+                raise InputError(
+                    f"{self.name}: {what} is {array.shape[1]}x{array.shape[0]}, the image {width}x{height}; "
+                    "they must have the same size"
+                )
+
+    @property
+    def number(self) -> int:
+        return frame_number(self.name)
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(H, W) bool: inside the mask and inside the camera model's field."""
+        rays_valid = self.camera.rays()[1]
+        return rays_valid if self.mask is None else self.mask & rays_valid
+
+
+def check_image_size(name: str, width: int, height: int, camera: CameraModel) -> None:
+    """Raises InputError, with the ratio and the cure, when the camera was calibrated at another image size."""
+    if (camera.width, camera.height) == (width, height):
+        return
+    sx, sy = width / camera.width, height / camera.height
+    found = f"{name}: the image is {width}x{height}, the camera {camera.width}x{camera.height}"
+    if abs(sx / sy - 1) < 0.01:
+        raise InputError(
+            f"{found}: ratio {sx:.4g}. If the image was only resized, rescale the camera: multiply fx, fy, cx, cy by "
+            f"{sx:.6g} and set width {width}, height {height} (CameraModel.resized does it)"
+        )
+    raise InputError(
+        f"{found}: ratios {sx:.4g} in width and {sy:.4g} in height differ, so the image was cropped or padded; "
+        "give the calibration of this image format"
+    )
+
+
+class FrameBatch(NamedTuple):
+    """What a DataLoader yields. Rays, not cameras: no loss ever asks which lens it is.
+
+    image (B, 3, H, W) encoded RGB; mask (B, 1, H, W) bool; rays (B, 3, H, W) unit; light terms;
+    true_distance (B, 1, H, W), zero where true_valid (B, 1, H, W) bool is False.
+    """
+
+    image: Tensor
+    mask: Tensor
+    rays: Tensor
+    light: LightTerms
+    true_distance: Tensor
+    true_valid: Tensor
+
+    def to(self, device: torch.device | str) -> FrameBatch:
+        moved = {name: value.to(device) for name, value in self._asdict().items() if name != "light"}
+        return FrameBatch(light=LightTerms(*(term.to(device) for term in self.light)), **moved)
+
+
+def to_batch(frame: Frame, size: tuple[int, int] | None = None) -> FrameBatch:
+    """A batch of one, resized to (width, height) where given.
+
+    Images are averaged over the pixels they merge (area), truth is sampled (nearest), so that no distance is invented
+    between a fold and what lies behind it. A pixel is valid when every pixel it merges is.
+    """
+    import cv2
+
+    image, valid, camera = frame.image, frame.valid, frame.camera
+    truth = np.zeros(valid.shape, np.float32) if frame.true_distance is None else frame.true_distance
+    if size is not None and size != (camera.width, camera.height):
+        smaller = size[0] < camera.width or size[1] < camera.height
+        how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+        image = cv2.resize(image, size, interpolation=how)
+        share = cv2.resize(valid.astype(np.float32), size, interpolation=how)
+        truth = cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        camera = camera.resized(*size)
+        valid = share > 0.999
+    rays, rays_valid = camera.rays()
+    valid = valid & rays_valid
+
+    def tensor(array: np.ndarray) -> Tensor:
+        array = array[..., None] if array.ndim == 2 else array
+        return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))[None]
+
+    true_valid = np.isfinite(truth) & (truth > 0) & valid
+    return FrameBatch(
+        image=tensor(image.astype(np.float32)),
+        mask=tensor(valid),
+        rays=tensor(rays.astype(np.float32)),  # outside the field too: a jump there would bend normals and areas inside
+        light=frame.light.terms(),
+        true_distance=tensor(np.where(true_valid, truth, 0).astype(np.float32)),
+        true_valid=tensor(true_valid),
+    )

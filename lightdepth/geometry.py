@@ -1,0 +1,45 @@
+"""Distance and depth, points and normals. Pure functions on image tensors (B, C, H, W) or arrays.
+
+Notation: distance t along the unit ray r, depth z along the optical axis, X = t r the point in camera axes. Shapes of
+distance and depth (B, 1, H, W), of rays, points and normals (B, 3, H, W), unless said otherwise.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def depth_from_distance(distance, ray_z):
+    """z = t r_z, elementwise on arrays or tensors."""
+    return distance * ray_z
+
+
+def distance_from_depth(depth, ray_z):
+    """t = z / r_z, elementwise on arrays or tensors. The caller keeps to rays with r_z > 0."""
+    return depth / ray_z
+
+
+def normals_from_distance(distance: Tensor, rays: Tensor) -> Tensor:
+    """Unit normals of the surface t·r by central differences, facing the camera (n · r <= 0).
+
+    At the image's border the difference is one-sided. Where the surface is degenerate the normal is -r.
+    """
+    points = distance * rays
+    padded = F.pad(points, (1, 1, 1, 1), mode="replicate")
+    along_u = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
+    along_v = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
+    normal = torch.linalg.cross(along_v, along_u, dim=-3)  # v x u points to the camera where z points into the scene
+    length = normal.norm(dim=-3, keepdim=True)
+    scale = (along_u.norm(dim=-3, keepdim=True) * along_v.norm(dim=-3, keepdim=True)).clamp(min=1e-20)
+    good = length > 1e-6 * scale
+    normal = torch.where(good, normal / torch.where(good, length, torch.ones_like(length)), -rays)
+    facing = (normal * rays).sum(-3, keepdim=True)
+    return torch.where(facing > 0, -normal, normal)
+
+
+def pixel_solid_angle(rays: Tensor) -> Tensor:
+    """Solid angle of each pixel [sr] (B, 1, H, W), from differences of neighbouring rays, one-sided at the border."""
+    du, dv = (torch.gradient(rays, dim=dim)[0] if rays.shape[dim] > 1 else torch.zeros_like(rays) for dim in (-1, -2))
+    return torch.linalg.cross(du, dv, dim=-3).norm(dim=-3, keepdim=True)

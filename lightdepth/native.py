@@ -1,0 +1,62 @@
+"""Libraries that need a hand before they can be imported: the one place for such tricks."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from types import ModuleType
+
+from lightdepth.errors import InputError
+
+SYSTEM_LIBRARIES = {  # what Open3D links against: file wanted by the loader -> Debian package
+    "libGL.so.1": "libgl1",
+    "libEGL.so.1": "libegl1",
+    "libX11.so.6": "libx11-6",
+    "libgomp.so.1": "libgomp1",
+}
+
+
+def missing_system_libraries() -> list[str]:
+    """Debian packages of the shared libraries that Open3D needs and the loader does not find."""
+    missing = []
+    for library, package in SYSTEM_LIBRARIES.items():
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            missing.append(package)
+    return missing
+
+
+@cache
+def open3d() -> ModuleType:
+    """The open3d module. libusb-1.0, which Open3D 0.20 links against and slim systems lack, comes from its pip package.
+
+    Raises InputError with the system packages to install when Open3D cannot be loaded.
+    """
+    try:
+        import libusb_package
+
+        path = libusb_package.get_library_path()
+        if path is not None:
+            ctypes.CDLL(str(path), ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError):
+        pass  # a system libusb may do; if not, the import below says what is missing
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        packages = " ".join(["libusb-1.0-0", *SYSTEM_LIBRARIES.values()])
+        raise InputError(
+            f"Open3D cannot be loaded ({error}). On Debian or Ubuntu: apt-get install {packages}"
+        ) from error
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d
+
+
+@cache
+def pycolmap() -> ModuleType:
+    """The pycolmap module. cv2 comes first: two copies of zlib otherwise abort the process at the first PNG written."""
+    import cv2  # noqa: F401
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 2
+    return pycolmap

@@ -1,0 +1,168 @@
+"""Image formation under a light that travels with the camera (LightDepth; spot light of Modrzejewski 2020).
+
+Notation: d distance from the camera centre to the surface, r unit viewing ray, x = d r; P light position, D its unit
+direction, l = (x - P) / |x - P|, mu its spread; n unit normal, cos = n · (-l); rho albedo in [0, 1]; gain g.
+Radiance is linear; `encode` applies the response of gamma. Images are (B, C, H, W), light terms (B, 1, 1, 1).
+
+    linear = g · rho · exp(-mu (1 - D · l)) · cos^q / |x - P|²  +  g · rho · indirect,      image = linear^(1/gamma)
+
+1/pi and the light's radiance are absorbed by the unit of d: with gain 1, a white wall that faces the light on its axis
+is exactly white at distance 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lightdepth.errors import InputError
+
+DEFAULT_GAMMA, DEFAULT_MU = 2.2, 2.767
+
+
+@dataclass(frozen=True)
+class PhotometricCalibration:
+    """Light and response of one endoscope. `position_mm` in camera axes; `direction` is normalised at birth.
+
+    `reflectance` is the share of light that the wall throws back for others to receive (radiosity's rho).
+    `source` says where the numbers come from: measured, published or assumed.
+    """
+
+    gamma: float = DEFAULT_GAMMA
+    mu: float = DEFAULT_MU
+    position_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    gain: float = 1.0
+    reflectance: float = 0.0
+    source: str = "assumed"
+
+    def __post_init__(self) -> None:
+        if len(self.position_mm) != 3 or len(self.direction) != 3:
+            raise InputError(
+                f"light: position_mm {self.position_mm}, direction {self.direction}; expected 3 numbers each"
+            )
+        numbers = [self.gamma, self.mu, self.gain, self.reflectance, *self.position_mm, *self.direction]
+        if not np.isfinite(numbers).all():
+            raise InputError("light: a value is not finite")
+        if not 0.2 <= self.gamma <= 10:
+            raise InputError(f"light: gamma {self.gamma}; expected a response exponent between 0.2 and 10, usually 2.2")
+        if self.mu < 0 or self.gain <= 0 or not 0 <= self.reflectance < 1:
+            raise InputError(
+                f"light: mu {self.mu}, gain {self.gain}, reflectance {self.reflectance}; "
+                "expected mu >= 0, gain > 0 and 0 <= reflectance < 1"
+            )
+        length = float(np.linalg.norm(self.direction))
+        if length == 0:
+            raise InputError("light: direction is zero; expected a vector into the scene such as [0, 0, 1]")
+        object.__setattr__(self, "direction", tuple(float(v) / length for v in self.direction))
+        object.__setattr__(self, "position_mm", tuple(map(float, self.position_mm)))
+
+    def co_located(self) -> PhotometricCalibration:
+        """The same light moved to the camera centre and turned along the axis: what an up-to-scale distance can use."""
+        return replace(self, position_mm=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0))
+
+    def terms(self, dtype: torch.dtype = torch.float32) -> LightTerms:
+        """Tensors for one image (batch of 1)."""
+
+        def shaped(value: float | tuple[float, ...]) -> Tensor:
+            return torch.tensor(value, dtype=dtype).reshape(1, -1, 1, 1)
+
+        return LightTerms(
+            gamma=shaped(self.gamma),
+            mu=shaped(self.mu),
+            gain=shaped(self.gain),
+            reflectance=shaped(self.reflectance),
+            position=shaped(self.position_mm),
+            direction=shaped(self.direction),
+        )
+
+
+class LightTerms(NamedTuple):
+    """A batch of lights: scalars (B, 1, 1, 1), vectors (B, 3, 1, 1). Position in the unit of distance."""
+
+    gamma: Tensor
+    mu: Tensor
+    gain: Tensor
+    reflectance: Tensor
+    position: Tensor
+    direction: Tensor
+
+    def co_located(self) -> LightTerms:
+        """At the camera centre, along the axis."""
+        axis = torch.zeros_like(self.direction)
+        axis[:, 2] = 1.0
+        return self._replace(position=torch.zeros_like(self.position), direction=axis)
+
+
+def light_distance(distance: Tensor, rays: Tensor, light: LightTerms) -> tuple[Tensor, Tensor]:
+    """|x - P| (B, 1, H, W) and l (B, 3, H, W)."""
+    from_light = distance * rays - light.position
+    length = from_light.norm(dim=-3, keepdim=True)
+    return length, from_light / length.clamp(min=1e-12)
+
+
+def spread(towards: Tensor, light: LightTerms) -> Tensor:
+    """exp(-mu (1 - D · l)), (B, 1, H, W)."""
+    return torch.exp(-light.mu * (1 - (light.direction * towards).sum(-3, keepdim=True)))
+
+
+def irradiance(
+    distance: Tensor,
+    normals: Tensor,
+    rays: Tensor,
+    light: LightTerms,
+    cosine_exponent: float = 1.0,
+    cosine_floor: float = 0.0,
+) -> Tensor:
+    """Direct light that falls on the surface: exp(-mu (1 - D · l)) cos^q / |x - P|², (B, 1, H, W)."""
+    length, towards = light_distance(distance, rays, light)
+    cosine = (-towards * normals).sum(-3, keepdim=True).clamp(min=cosine_floor)
+    if cosine_exponent != 1.0:
+        cosine = cosine.clamp(min=1e-6) ** cosine_exponent
+    return spread(towards, light) * cosine / length.square().clamp(min=1e-12)
+
+
+def render(
+    distance: Tensor,
+    normals: Tensor,
+    rays: Tensor,
+    albedo: Tensor,
+    light: LightTerms,
+    indirect: Tensor | float = 0.0,
+    cosine_exponent: float = 1.0,
+) -> Tensor:
+    """The encoded image (B, C, H, W), not clipped: values above 1 are what the sensor would saturate."""
+    direct = irradiance(distance, normals, rays, light, cosine_exponent)
+    return encode(light.gain * albedo * (direct + indirect), light.gamma)
+
+
+def encode(linear: Tensor, gamma: Tensor | float) -> Tensor:
+    """Linear radiance to the camera's code values: v^(1/gamma), 0 (with gradient 0) where it is not positive."""
+    lit = linear > 0  # the power's slope at 0 is infinite: times the zero gradient of a clamped cosine it makes NaN
+    return torch.where(lit, torch.where(lit, linear, 1.0) ** (1 / gamma), 0.0)
+
+
+def decode(image: Tensor, gamma: Tensor | float) -> Tensor:
+    """Code values to linear radiance: v^gamma."""
+    return image.clamp(min=0) ** gamma
+
+
+def brightness(image: Tensor) -> Tensor:
+    """V = max(R, G, B), the channel that carries no albedo when the albedo's value is 1. (B, 1, H, W)"""
+    return image.amax(-3, keepdim=True)
+
+
+def hue_saturation_albedo(hue_saturation: Tensor) -> Tensor:
+    """RGB albedo with value 1 from (hue, saturation) in [0, 1], (B, 2, H, W) -> (B, 3, H, W).
+
+    Hue is stored half a turn off (0.5 = red), so that tissue, which is red, does not sit on the seam of the circle.
+    """
+    hue, saturation = hue_saturation[..., :1, :, :] + 0.5, hue_saturation[..., 1:, :, :]
+    offsets = torch.tensor([0.0, 2 / 3, 1 / 3], dtype=hue.dtype, device=hue.device).reshape(3, 1, 1)
+    position = (hue + offsets) % 1.0  # fraction of the circle from each primary
+    ramp = ((position * 6 - 3).abs() - 1).clamp(0, 1)
+    return 1 - saturation * (1 - ramp)

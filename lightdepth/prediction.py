@@ -1,0 +1,83 @@
+"""DepthPrediction: what a model says about one frame, and its file."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lightdepth.camera import CameraModel, camera_from_params
+from lightdepth.errors import InputError
+
+_UNREADABLE = (OSError, EOFError, KeyError, ValueError, TypeError, AssertionError, zipfile.BadZipFile, zlib.error)
+
+
+@dataclass(frozen=True)
+class DepthPrediction:
+    """Distance along the ray at every pixel of a frame, up to one scale per frame.
+
+    distance (H, W) float32 > 0 where valid (H, W) bool; albedo (H, W, 3) and normals (H, W, 3) float32 or None;
+    uncertainty (H, W) float32, standard deviation of log distance, or None when the model does not estimate it.
+    `unit` is "up to scale" or "mm"; `source` names model and checkpoint.
+    """
+
+    name: str
+    distance: np.ndarray
+    valid: np.ndarray
+    camera: CameraModel
+    source: str
+    unit: str = "up to scale"
+    albedo: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    uncertainty: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        shape = (self.camera.height, self.camera.width)
+        assert self.distance.shape == shape == self.valid.shape, (self.distance.shape, self.valid.shape, shape)
+        assert self.valid.dtype == bool, self.valid.dtype
+
+    def scaled(self, scale: float) -> DepthPrediction:
+        """The prediction with its distance multiplied by `scale`."""
+        return replace(self, distance=self.distance * np.float32(scale))
+
+    def save(self, path: Path) -> None:
+        """One compressed .npz, with unit, camera and provenance in `meta`."""
+        camera = {
+            "model": self.camera.name,
+            "width": self.camera.width,
+            "height": self.camera.height,
+            "params": self.camera.params,
+            "pixel_center": 0.5,
+        }
+        meta = {"name": self.name, "unit": self.unit, "source": self.source, "camera": camera}
+        arrays: dict[str, Any] = {"distance": self.distance.astype(np.float32), "valid": self.valid}
+        for key in ("albedo", "normals", "uncertainty"):
+            value = getattr(self, key)
+            if value is not None:
+                arrays[key] = value.astype(np.float16 if key != "uncertainty" else np.float32)
+        np.savez_compressed(path, meta=np.array(json.dumps(meta)), **arrays)
+
+
+def read_prediction(path: Path) -> DepthPrediction:
+    """A prediction from its .npz. Raises InputError when it is not one."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            meta = json.loads(str(data["meta"]))
+            arrays = {key: data[key] for key in data.files if key != "meta"}
+        for key in arrays.keys() - {"valid"}:  # albedo and normals are stored in half precision
+            arrays[key] = arrays[key].astype(np.float32)
+        camera = meta["camera"]
+        return DepthPrediction(
+            name=meta["name"],
+            unit=meta["unit"],
+            source=meta["source"],
+            camera=camera_from_params(camera["model"], camera["width"], camera["height"], camera["params"], str(path)),
+            **arrays,
+        )
+    except _UNREADABLE as error:
+        raise InputError(f"{path}: not a prediction made by `lightdepth predict` ({error})") from error

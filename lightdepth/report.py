@@ -1,0 +1,68 @@
+"""One offline HTML file: headings, sentences, tables and pictures, with nothing loaded from anywhere."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd; }
+table { border-collapse: collapse; margin: .8rem 0; } th, td { padding: .25rem .8rem; text-align: right; }
+th { border-bottom: 2px solid #888; font-weight: 600; } td { border-bottom: 1px solid #e5e5e5; }
+th:first-child, td:first-child { text-align: left; } td.text { text-align: left; }
+figure { margin: 1rem 0; } figure img { max-width: 100%; } figcaption { color: #555; font-size: .9rem; }
+.figures { display: flex; flex-wrap: wrap; gap: 1rem; } .figures figure { margin: 0; flex: 1 1 300px; }
+"""
+
+
+class Report:
+    """Collects the parts of a page in order."""
+
+    def __init__(self, title: str):
+        self._title = title
+        self._parts = [f"<h1>{html.escape(title)}</h1>"]
+
+    def heading(self, text: str) -> None:
+        self._parts.append(f"<h2>{html.escape(text)}</h2>")
+
+    def text(self, text: str) -> None:
+        self._parts.append(f"<p>{html.escape(text)}</p>")
+
+    def table(self, headers: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+        """Numbers are shown with three significant digits; give strings where that is not wanted."""
+        head = "".join(f"<th>{html.escape(h)}</th>" for h in headers)
+        body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
+        self._parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+
+    def figures(self, pictures: Sequence[tuple[bytes, str]]) -> None:
+        """PNG pictures with captions, beside each other where there is room."""
+        self._parts.append('<div class="figures">' + "".join(_figure(*p) for p in pictures) + "</div>")
+
+    def write(self, path: Path) -> None:
+        head = f'<meta charset="utf-8"><title>{html.escape(self._title)}</title><style>{_STYLE}</style>'
+        path.write_text(f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(self._parts)}</body></html>\n")
+
+
+def _figure(data: bytes, caption: str) -> str:
+    source = base64.b64encode(data).decode()
+    text = html.escape(caption)
+    return f'<figure><img alt="{text}" src="data:image/png;base64,{source}"><figcaption>{text}</figcaption></figure>'
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, str):
+        return f'<td class="text">{html.escape(value)}</td>'
+    return f"<td>{number(value)}</td>"
+
+
+def number(value: Any) -> str:
+    """A number for people: integers whole, others with three significant digits, nothing as a dash."""
+    if value is None or (isinstance(value, float) and value != value):
+        return "–"
+    if isinstance(value, int):
+        return str(value)
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

@@ -1,0 +1,177 @@
+"""Run folders: what a verb writes appears whole or not at all, and says how it was made.
+
+Work goes to `OUT.partial` beside OUT and is renamed when it is complete; run.json is written last. A verb that fails
+leaves OUT as it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from lightdepth.errors import InputError, PartialFailure
+
+PACKAGES = (
+    "lightdepth",
+    "torch",
+    "lightning",
+    "kornia",
+    "numpy",
+    "scipy",
+    "open3d",
+    "open3d-cpu",
+    "pycolmap",
+    "opencv-python-headless",
+)
+
+
+class Run:
+    """An output folder in the making. `folder` is where to write; `record` is what run.json will say besides."""
+
+    def __init__(self, folder: Path, verb: str, arguments: Mapping[str, Any]):
+        self.folder = folder
+        self.record: dict[str, Any] = {"failures": []}
+        self._verb, self._arguments, self._start = verb, plain(arguments), time.time()
+
+    def log(self, message: str) -> None:
+        """A line for the user and for log.txt."""
+        print(message, flush=True)
+        with (self.folder / "log.txt").open("a") as file:
+            file.write(f"{time.strftime('%H:%M:%S')} {message}\n")
+
+    def fail(self, what: str, reason: str) -> None:
+        """Part of the work failed; the rest goes on (exit code 4 at the end)."""
+        self.record["failures"].append({"what": what, "reason": reason})
+        self.log(f"failed: {what}: {reason}")
+
+    def hash_input(self, name: str, path: Path | None) -> None:
+        if path is not None:
+            self.record.setdefault("inputs", {})[name] = {"path": str(path), "sha256": input_hash(path)}
+
+    def finish(self) -> None:
+        import yaml
+
+        (self.folder / "config.yaml").write_text(yaml.safe_dump(self._arguments, sort_keys=False))
+        write_run_json(self.folder, self._verb, self._arguments, self._start, self.record)
+
+
+@contextmanager
+def run_folder(output: Path, verb: str, arguments: Mapping[str, Any], overwrite: bool = False) -> Iterator[Run]:
+    """A Run whose folder becomes `output` when the block ends well. Raises InputError when `output` is in use."""
+    output = Path(output)
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; expected a folder to make")
+    if output.is_dir() and any(output.iterdir()):
+        if not overwrite:
+            raise InputError(f"{output}: already there and not empty; choose another -o, or give --overwrite")
+        if not (output / "run.json").is_file():
+            raise InputError(f"{output}: not overwritten, it has no run.json and so was not made by this program")
+    staging = output.with_name(output.name + ".partial")
+    shutil.rmtree(staging, ignore_errors=True)
+    try:
+        staging.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{output}: cannot be made ({error.strerror})") from error
+    run = Run(staging, verb, arguments)
+    try:
+        yield run
+        run.finish()
+    except BaseException:
+        shutil.rmtree(staging, ignore_errors=True)
+        raise
+    if output.is_dir():
+        shutil.rmtree(output)
+    staging.rename(output)
+    if run.record["failures"]:
+        first = run.record["failures"][0]
+        raise PartialFailure(
+            f"{len(run.record['failures'])} part(s) failed, the first: {first['what']}: {first['reason']}. "
+            f"The rest is in {output}"
+        )
+
+
+def write_run_json(
+    folder: Path, verb: str, arguments: Mapping[str, Any], start: float, record: Mapping[str, Any]
+) -> None:
+    """run.json, by rename, so that its presence means that the run is complete. `start` as of time.time()."""
+    data = {
+        "verb": verb,
+        "arguments": plain(arguments),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "versions": versions(),
+        "revision": git_revision(),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start)),
+        "seconds": round(time.time() - start, 3),
+        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        **plain(record),
+    }
+    partial = folder / "run.json.partial"
+    partial.write_text(json.dumps(data, indent=1) + "\n")
+    os.replace(partial, folder / "run.json")
+
+
+def versions() -> dict[str, str]:
+    """Installed versions of Python and of the packages that results depend on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def git_revision() -> str | None:
+    """Revision of the program's own checkout ("+" with uncommitted changes), or None outside one."""
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        call = {"cwd": root, "capture_output": True, "text": True, "timeout": 10, "check": True}
+        revision = subprocess.run(["git", "rev-parse", "HEAD"], **call).stdout.strip()  # type: ignore[call-overload]
+        changed = subprocess.run(["git", "status", "--porcelain", "-uno"], **call).stdout.strip()  # type: ignore[call-overload]
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return revision + ("+" if changed else "")
+
+
+def input_hash(path: Path) -> str:
+    """SHA-256 over names and sizes of the files below a path, and over the contents of those up to 1 MB."""
+    digest = hashlib.sha256()
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        size = file.stat().st_size
+        digest.update(f"{file.relative_to(path) if path.is_dir() else file.name}\0{size}\0".encode())
+        if size <= 1 << 20:
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def plain(value: Any) -> Any:
+    """Dataclasses, paths, tuples and numpy scalars as what JSON and YAML know."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:
+        value = value.item()
+    if (isinstance(value, float) and value not in (value,)) or value in (float("inf"), float("-inf")):
+        return None
+    return value

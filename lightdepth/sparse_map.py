@@ -1,0 +1,149 @@
+"""Keyframe, Submap, SparseMap: what a monocular SLAM or SfM knows.
+
+A submap is a set of points and of keyframes that saw them, in one frame of reference and one arbitrary scale ("map
+units"). Nothing relates two submaps. Poses are `cam_from_map` (4, 4) float64; pixels (n, 2) have the first pixel's
+centre at (0.5, 0.5) whatever the file said.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lightdepth.camera import CameraModel
+from lightdepth.errors import InputError
+from lightdepth.frame import frame_number
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A posed frame and the map points it observed: pixels (n, 2) and point_ids (n,), which index into the submap."""
+
+    name: str
+    camera: CameraModel
+    cam_from_map: np.ndarray
+    pixels: np.ndarray
+    point_ids: np.ndarray
+
+    def __post_init__(self) -> None:
+        check_rigid(self.cam_from_map, f"keyframe {self.name}")
+        if len(self.pixels) != len(self.point_ids):
+            raise InputError(f"keyframe {self.name}: {len(self.pixels)} keypoints, {len(self.point_ids)} point ids")
+
+    @property
+    def number(self) -> int:
+        return frame_number(self.name)
+
+    @property
+    def center(self) -> np.ndarray:
+        """Camera centre in the map (3,)."""
+        return -self.cam_from_map[:3, :3].T @ self.cam_from_map[:3, 3]
+
+    def in_camera(self, points: np.ndarray) -> np.ndarray:
+        """Map points (n, 3) in camera axes."""
+        return points @ self.cam_from_map[:3, :3].T + self.cam_from_map[:3, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """Points (n, 3) by id, and the keyframes that share their frame of reference and scale."""
+
+    id: int
+    keyframes: tuple[Keyframe, ...]
+    point_ids: np.ndarray
+    points: np.ndarray
+    weak_visibility: bool = False
+    """True when observations were guessed by projection instead of read."""
+
+    def __post_init__(self) -> None:
+        if not len(self.points):
+            raise InputError(f"map {self.id} has no points")
+        if not self.keyframes:
+            raise InputError(f"map {self.id} has no keyframes")
+        if len(self.points) != len(self.point_ids):
+            raise InputError(f"map {self.id}: {len(self.points)} points, {len(self.point_ids)} point ids")
+        ids, counts = np.unique(self.point_ids, return_counts=True)
+        if len(ids) < len(self.point_ids):
+            raise InputError(f"map {self.id}: point {ids[counts > 1][0]} is in it twice; a point's id must be unique")
+        if not np.isfinite(self.points).all():
+            bad = self.point_ids[~np.isfinite(self.points).all(1)]
+            raise InputError(f"map {self.id}: {len(bad)} points are not finite, the first is point {bad[0]}")
+        twice = sorted(n for n, times in Counter(k.number for k in self.keyframes).items() if times > 1)
+        if twice:
+            raise InputError(f"map {self.id}: frame {twice[0]} is in it twice; a keyframe's number must be unique")
+
+    @cached_property
+    def _rows_by_id(self) -> np.ndarray:
+        return np.argsort(self.point_ids, kind="stable")
+
+    def rows_of(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (n,) of points by id (n,), and whether the map holds each (n,); rows of others are arbitrary."""
+        place = np.searchsorted(self.point_ids, ids, sorter=self._rows_by_id)
+        rows = self._rows_by_id[np.minimum(place, len(self.point_ids) - 1)]
+        return rows, self.point_ids[rows] == ids
+
+    def observed_points(self, keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ids (n,), map points (n, 3) and pixels (n, 2) that a keyframe observed, each point once.
+
+        Observations of points that the map no longer holds are left out.
+        """
+        rows, held = self.rows_of(keyframe.point_ids)
+        first = np.unique(np.where(held, rows, -1), return_index=True)[1]
+        chosen = np.sort(first[held[first]])
+        return keyframe.point_ids[chosen], self.points[rows[chosen]], keyframe.pixels[chosen].reshape(-1, 2)
+
+    def reprojection_errors(self) -> np.ndarray:
+        """Distance in pixels between every observation and its point's projection; points not in view are left out."""
+        errors = []
+        for keyframe in self.keyframes:
+            _, points, pixels = self.observed_points(keyframe)
+            projected, valid = keyframe.camera.project(keyframe.in_camera(points))
+            errors.append(np.linalg.norm(projected - pixels, axis=1)[valid])
+        return np.concatenate(errors)
+
+
+@dataclass(frozen=True)
+class SparseMap:
+    """All submaps of one sequence. Where they came from is kept for messages."""
+
+    submaps: tuple[Submap, ...]
+    source: str
+
+    def __post_init__(self) -> None:
+        if not self.submaps:
+            raise InputError(f"{self.source}: no map in it")
+        twice = sorted(i for i, times in Counter(s.id for s in self.submaps).items() if times > 1)
+        if twice:
+            raise InputError(f"{self.source}: two maps have the id {twice[0]}; every submap needs its own")
+
+
+def covisibility(submap: Submap) -> np.ndarray:
+    """How many points each pair of keyframes shares, (n, n) int with each keyframe's own count on the diagonal."""
+    seen = np.zeros((len(submap.keyframes), len(submap.points)), np.int32)
+    for row, keyframe in enumerate(submap.keyframes):
+        ids = submap.observed_points(keyframe)[0]
+        seen[row, submap.rows_of(ids)[0]] = 1
+    return seen @ seen.T
+
+
+def check_rigid(transform: np.ndarray, what: str) -> None:
+    """Raises InputError unless (4, 4) is a finite rotation and translation."""
+    if transform.shape != (4, 4):
+        raise InputError(f"{what}: pose of shape {transform.shape}; expected (4, 4)")
+    if not np.isfinite(transform).all():
+        raise InputError(f"{what}: the pose has NaN or infinite numbers")
+    rotation = transform[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > 1e-3 or np.linalg.det(rotation) < 0:
+        raise InputError(
+            f"{what}: the pose is not a rotation and translation (R R^T is {off:.2g} from the identity, "
+            f"det {np.linalg.det(rotation):.3g}); is it scaled, or mirrored?"
+        )
+    if np.abs(transform[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise InputError(
+            f"{what}: the last row of the pose is {transform[3].tolist()}; expected [0, 0, 0, 1]. "
+            "Is it flattened column by column?"
+        )

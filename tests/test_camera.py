@@ -1,0 +1,283 @@
+"""Every lens maps its whole field both ways, and says where the field ends."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scenes import BROWN, C3VD, ENDOMAPPER, LENSES, PINHOLE
+
+from lightdepth import native
+from lightdepth.camera import (
+    CAMERA_MODELS,
+    Brown,
+    CameraModel,
+    KannalaBrandt,
+    Pinhole,
+    Scaramuzza,
+    camera_from_params,
+)
+from lightdepth.errors import InputError
+
+VARIANTS = {
+    "as published": lambda camera: camera,
+    "resized": lambda camera: camera.resized(camera.width // 5, camera.height // 5),
+    "resized unequally": lambda camera: camera.resized(camera.width // 2, camera.height),
+    "cropped about the middle": lambda camera: camera.cropped(camera.width // 2 - 20, camera.height // 2 - 30, 64, 48),
+    "cropped near the border": lambda camera: camera.cropped(10, camera.height // 2, 64, 48),
+    "first pixel at (0, 0)": lambda camera: camera.with_pixel_center(0.0),
+}
+
+
+@pytest.fixture(params=LENSES.values(), ids=LENSES.keys())
+def lens(request) -> CameraModel:
+    return request.param
+
+
+def pixels_inside(camera: CameraModel, n: int = 4000) -> np.ndarray:
+    return np.random.default_rng(0).uniform(0, 1, (n, 2)) * (camera.width, camera.height)
+
+
+def all_around(n: int = 20_000) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    special = np.array([[0, 0, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 0], [1e-15, 0, 1], [1e-15, 0, -1]], float)
+    return np.concatenate([special, rng.normal(size=(n, 3)) * rng.lognormal(0, 3, (n, 1))])
+
+
+@pytest.mark.parametrize("variant", VARIANTS.values(), ids=VARIANTS.keys())
+def test_projecting_a_point_on_the_ray_of_a_pixel_returns_the_pixel(lens, variant):
+    camera = variant(lens)
+    pixels = pixels_inside(camera)
+    rays, valid = camera.unproject(pixels)
+    assert valid.mean() > 0.8
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, atol=1e-12)
+    distance = np.random.default_rng(2).lognormal(0, 3, (len(pixels), 1))
+    projected, seen = camera.project(rays * distance)
+    np.testing.assert_array_equal(seen[valid], True)
+    np.testing.assert_allclose(projected[valid], pixels[valid], rtol=0, atol=1e-6)
+
+
+def test_rays_of_points_in_view_are_the_directions_of_the_points(lens):
+    points = all_around()
+    pixels, seen = lens.project(points)
+    rays, valid = lens.unproject(pixels[seen])
+    assert seen.sum() > 500
+    assert valid.mean() > 0.999
+    directions = points[seen] / np.linalg.norm(points[seen], axis=1, keepdims=True)
+    np.testing.assert_allclose(rays[valid], directions[valid], atol=1e-8)
+
+
+def test_rays_are_those_of_the_pixel_centres_and_cannot_be_written(lens):
+    camera = lens.resized(16, 12)
+    rays, valid = camera.rays()
+    assert rays.shape == (12, 16, 3) and valid.shape == (12, 16)
+    for row, column in [(0, 0), (3, 7), (11, 15)]:
+        ray, ok = camera.unproject(np.array([column + 0.5, row + 0.5]))
+        np.testing.assert_allclose(rays[row, column], ray, atol=1e-12)
+        assert valid[row, column] == ok
+    with pytest.raises(ValueError, match="read-only"):
+        rays[0, 0] = 0
+
+
+def test_everything_is_finite_wherever_one_asks(lens):
+    pixels, _ = lens.project(all_around())
+    assert np.isfinite(pixels).all()
+    far = np.random.default_rng(3).uniform(-5, 6, (5000, 2)) * (lens.width, lens.height)
+    rays, _ = lens.unproject(far)
+    assert np.isfinite(rays).all()
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, atol=1e-12)
+
+
+def test_points_behind_the_camera_and_pixels_outside_the_image_are_not_seen(lens):
+    points = all_around()
+    pixels, seen = lens.project(points)
+    assert not seen[points[:, 2] <= 0].any()
+    inside = (pixels >= 0).all(1) & (pixels <= (lens.width, lens.height)).all(1)
+    assert not seen[~inside].any()
+
+
+def test_every_valid_ray_looks_ahead(lens):
+    rays, valid = lens.resized(160, 120).rays()
+    assert (rays[valid][:, 2] > 0).all()
+
+
+def test_kannala_brandt_ends_at_90_degrees_just_before_it_turns_over():
+    limit = ENDOMAPPER.max_theta()
+    assert limit == pytest.approx(np.pi / 2)
+    theta = np.radians([0, 45, 77.7, 89.9, 90.1, 90.6, 100, 135, 180])
+    points = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], -1)
+    wide = ENDOMAPPER.cropped(-1000, -1000, 4000, 4000)  # so that only the model's field decides
+    np.testing.assert_array_equal(wide.project(points)[1], theta < limit)
+    # Without the limit of 90 degrees, the published polynomial stops growing at 90.5 (FORMATS, EndoMapper)
+    fine = np.linspace(0, np.pi, 200_001)
+    k1, k2, k3, k4 = ENDOMAPPER.params[4:]
+    turn = fine[np.argmax(np.diff(fine + k1 * fine**3 + k2 * fine**5 + k3 * fine**7 + k4 * fine**9) <= 0)]
+    assert np.degrees(turn) == pytest.approx(90.5, abs=0.1)
+
+
+def test_kannala_brandt_that_turns_over_early_is_invalid_from_there_on():
+    camera = KannalaBrandt(400, 400, 200.0, 200.0, 200.0, 200.0, -0.4, 0.0, 0.0, 0.0)
+    turn = np.sqrt(1 / 1.2)
+    assert camera.max_theta() == pytest.approx(turn)
+    theta = np.array([turn - 1e-3, turn + 1e-3])
+    seen = camera.project(np.stack([np.sin(theta), 0 * theta, np.cos(theta)], -1))[1]
+    np.testing.assert_array_equal(seen, [True, False])
+    radius = 200 * (turn - 0.4 * turn**3)
+    valid = camera.unproject(np.array([[200 + radius - 0.1, 200.0], [200 + radius + 0.1, 200.0]]))[1]
+    np.testing.assert_array_equal(valid, [True, False])
+
+
+@pytest.mark.parametrize("camera", [ENDOMAPPER, C3VD], ids=["endomapper", "c3vd"])
+def test_black_corners_of_an_endoscope_have_no_ray(camera):
+    valid = camera.resized(camera.width // 10, camera.height // 10).rays()[1]
+    assert not valid[[0, 0, -1, -1], [0, -1, 0, -1]].any()
+    assert valid[valid.shape[0] // 2].all()
+    assert 0.85 < valid.mean() < 1
+
+
+def test_c3vd_field_angles_are_the_published_ones():
+    left_and_top = np.array([[0.5, 543.5], [679.0, 0.5]])
+    angles = np.degrees(np.arccos(C3VD.unproject(left_and_top)[0][:, 2]))
+    np.testing.assert_allclose(angles, [63.6, 45.9], atol=0.05)
+
+
+def test_brown_is_invalid_beyond_the_radius_where_it_folds():
+    limit = BROWN._max_radius()
+    fine = np.linspace(0, 3, 300_001)
+    grows = np.diff(fine * (1 + BROWN.k1 * fine**2 + BROWN.k2 * fine**4)) > 0
+    if not grows.all():
+        assert limit == pytest.approx(fine[np.argmin(grows)], abs=1e-4)
+    folding = Brown(800, 600, 400.0, 400.0, 400.0, 300.0, -0.5, 0.0, 0.0, 0.0)
+    turn = np.sqrt(1 / 1.5)
+    points = np.array([[turn - 1e-3, 0, 1], [turn + 1e-3, 0, 1], [3 * turn, 0, 1]])
+    np.testing.assert_array_equal(folding.project(points)[1], [True, False, False])
+    edge = 400 + 400 * (turn - 0.5 * turn**3)
+    valid = folding.unproject(np.array([[edge - 0.1, 300.0], [edge + 0.1, 300.0]]))[1]
+    np.testing.assert_array_equal(valid, [True, False])
+
+
+def field_points(n: int = 3000, widest: float = 60.0) -> np.ndarray:
+    rng = np.random.default_rng(4)
+    theta, phi = np.radians(rng.uniform(0, widest, n)), rng.uniform(0, 2 * np.pi, n)
+    unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    return unit * rng.uniform(1, 100, (n, 1))
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, BROWN], ids=["pinhole", "brown"])
+def test_pinhole_and_brown_agree_with_opencv(camera):
+    points = field_points(widest=45)
+    expected = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.params[4:] or [0.0] * 4)
+    )[0]
+    np.testing.assert_allclose(camera._pixels(points)[0], expected[:, 0], atol=1e-9)
+
+
+def test_kannala_brandt_agrees_with_opencv():
+    points = field_points(widest=85)
+    expected = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), ENDOMAPPER.matrix, np.array(ENDOMAPPER.params[4:])
+    )[0]
+    np.testing.assert_allclose(ENDOMAPPER._pixels(points)[0], expected[:, 0], atol=1e-9)
+
+
+COLMAP_CAMERAS = {
+    "PINHOLE": PINHOLE.params,
+    "OPENCV": BROWN.params,
+    "OPENCV_FISHEYE": ENDOMAPPER.params,
+    "SIMPLE_PINHOLE": (700.0, 660.0, 540.0),
+    "SIMPLE_RADIAL": (700.0, 660.0, 540.0, -0.1),
+    "RADIAL": (700.0, 660.0, 540.0, -0.1, 0.02),
+    "SIMPLE_RADIAL_FISHEYE": (700.0, 660.0, 540.0, -0.05),
+    "RADIAL_FISHEYE": (700.0, 660.0, 540.0, -0.05, 0.003),
+}
+
+
+@pytest.mark.parametrize("model", COLMAP_CAMERAS)
+def test_colmap_models_agree_with_pycolmap_pixel_for_pixel(model):
+    params = list(COLMAP_CAMERAS[model])
+    ours = camera_from_params(model, 1440, 1080, params)
+    theirs = native.pycolmap().Camera(model=model, width=1440, height=1080, params=params)
+    points = field_points(500, widest=40)
+    np.testing.assert_allclose(ours._pixels(points)[0], theirs.img_from_cam(points), atol=1e-8)
+
+
+def test_scaramuzza_agrees_with_the_roots_of_its_polynomial():
+    stretch = np.array([[C3VD.c, C3VD.d], [C3VD.e, 1.0]])
+    for point in field_points(200, widest=85):
+        side = np.hypot(point[0], point[1])
+        roots = np.roots([C3VD.a4, C3VD.a3, C3VD.a2, C3VD.a1 - point[2] / side, C3VD.a0])
+        rho = min(roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real)
+        expected = stretch @ (rho * point[:2] / side) + (C3VD.cx, C3VD.cy)
+        np.testing.assert_allclose(C3VD._pixels(point)[0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(270, 216), (337, 270), (2000, 500), (100, 900)], ids=str)
+def test_resizing_is_exact_the_same_relative_place_has_the_same_ray(lens, size):
+    resized = lens.resized(*size)
+    assert (resized.width, resized.height) == size
+    place = np.random.default_rng(5).uniform(0, 1, (2000, 2))
+    rays, valid = lens.unproject(place * (lens.width, lens.height))
+    again, valid_again = resized.unproject(place * size)
+    assert (valid != valid_again).mean() < 0.002
+    both = valid & valid_again
+    np.testing.assert_allclose(again[both], rays[both], atol=1e-9)
+
+
+def test_resizing_and_back_gives_the_same_numbers(lens):
+    back = lens.resized(123, 456).resized(lens.width, lens.height)
+    np.testing.assert_allclose(back.params, lens.params, rtol=1e-12, atol=1e-15)
+
+
+def test_scaramuzza_resized_unequally_puts_the_stretch_into_c_and_d():
+    resized = C3VD.resized(675, 270)  # half and a quarter
+    assert resized.a0 == pytest.approx(C3VD.a0 / 4)
+    assert resized.a2 == pytest.approx(C3VD.a2 * 4)
+    assert resized.a4 == pytest.approx(C3VD.a4 * 64)
+    assert (resized.c, resized.d, resized.e) == pytest.approx((2 * C3VD.c, 2 * C3VD.d, C3VD.e))
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (300, 200), (420, 260)], ids=str)
+def test_a_crop_keeps_the_rays_of_its_pixels_wherever_it_lies(lens, corner):
+    x, y = corner
+    place = np.random.default_rng(6).uniform(0, 1, (500, 2)) * (64, 48)
+    rays, valid = lens.unproject(place + corner)
+    again, valid_again = lens.cropped(x, y, 64, 48).unproject(place)
+    np.testing.assert_array_equal(valid, valid_again)
+    np.testing.assert_allclose(again, rays, atol=1e-9)
+
+
+@pytest.mark.parametrize(("found", "shift"), [(0.0, 0.5), (0.5, 0.0), (1.0, -0.5)])
+def test_pixel_center_moves_the_principal_point_by_what_the_file_lacks(lens, found, shift):
+    moved = lens.with_pixel_center(found)
+    assert (moved.cx, moved.cy) == pytest.approx((lens.cx + shift, lens.cy + shift))
+    assert (moved.width, moved.height) == (lens.width, lens.height)
+
+
+def test_focal_length_is_pixels_per_radian_on_the_axis(lens):
+    angle = 1e-5
+    pixels = lens._pixels(np.array([[angle, 0, 1.0], [-angle, 0, 1.0], [0, angle, 1.0], [0, -angle, 1.0]]))[0]
+    across = np.linalg.norm(pixels[0] - pixels[1]), np.linalg.norm(pixels[2] - pixels[3])
+    assert lens.focal_length == pytest.approx(np.sqrt(across[0] * across[1]) / (2 * angle), rel=1e-3)
+
+
+def test_cameras_survive_their_file_form(lens):
+    again = camera_from_params(lens.name, lens.width, lens.height, list(lens.params))
+    assert again == lens and type(again) is CAMERA_MODELS[lens.name]
+
+
+BAD = {
+    "size 0x480": lambda: Pinhole(0, 480, 1.0, 1.0, 0.0, 0.0),
+    "fy not finite": lambda: Pinhole(640, 480, 1.0, np.nan, 0.0, 0.0),
+    "focal lengths -5": lambda: KannalaBrandt(640, 480, -5.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "a0 = -769": lambda: Scaramuzza(640, 480, 0.0, 0.0, -769.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
+    "singular": lambda: Scaramuzza(640, 480, 0.0, 0.0, 769.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "my.json: unknown camera model 'FOV'": lambda: camera_from_params("FOV", 640, 480, [1.0], "my.json"),
+    "my.json: PINHOLE has 4 parameters, found 3": lambda: camera_from_params("PINHOLE", 9, 9, [1.0] * 3, "my.json"),
+    "my.json: PINHOLE camera: focal": lambda: camera_from_params("PINHOLE", 9, 9, [-1.0] * 4, "my.json"),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_a_camera_that_cannot_be_is_refused_by_name(message):
+    with pytest.raises(InputError, match=message):
+        BAD[message]()

@@ -1,0 +1,150 @@
+"""What a monocular SLAM knows, and what is wrong with it when it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import C3VD, ENDOMAPPER
+from scipy.spatial.transform import Rotation
+
+from lightdepth.errors import InputError
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap, check_rigid, covisibility
+
+
+def pose(seed: int = 0, shift: float = 1.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_rotvec(rng.normal(size=3) * 0.2).as_matrix()
+    transform[:3, 3] = rng.normal(size=3) * shift
+    return transform
+
+
+def submap(n_points: int = 30, n_keyframes: int = 3, camera=ENDOMAPPER, id: int = 0) -> Submap:
+    """Random points in view of random keyframes; keyframe k observes points k, k + 1, ... under ids 100, 99, ..."""
+    rng = np.random.default_rng(7)
+    points = rng.uniform((-5, -5, 10), (5, 5, 30), (n_points, 3))
+    ids = 100 - np.arange(n_points)
+    keyframes = []
+    for k in range(n_keyframes):
+        cam_from_map = pose(k)
+        pixels = camera.project(points @ cam_from_map[:3, :3].T + cam_from_map[:3, 3])[0]
+        keyframes.append(Keyframe(f"{k:04d}.png", camera, cam_from_map, pixels[k:], ids[k:]))
+    return Submap(id, tuple(keyframes), ids, points)
+
+
+def test_keyframe_and_camera_axes_agree():
+    keyframe = submap().keyframes[1]
+    np.testing.assert_allclose(keyframe.in_camera(keyframe.center[None]), 0, atol=1e-12)
+    point = np.array([1.0, 2, 3])
+    expected = keyframe.cam_from_map @ np.append(point, 1)
+    np.testing.assert_allclose(keyframe.in_camera(point[None])[0], expected[:3])
+    assert keyframe.number == 1
+
+
+@pytest.mark.parametrize("camera", [ENDOMAPPER, C3VD], ids=["endomapper", "c3vd"])
+def test_observed_points_are_where_they_were_seen(camera):
+    found = submap(camera=camera)
+    for k, keyframe in enumerate(found.keyframes):
+        ids, points, pixels = found.observed_points(keyframe)
+        np.testing.assert_array_equal(ids, 100 - np.arange(k, 30))
+        np.testing.assert_array_equal(points, found.points[k:])
+        np.testing.assert_allclose(camera.project(keyframe.in_camera(points))[0], pixels)
+    assert found.reprojection_errors().max() < 1e-9
+
+
+def test_reprojection_error_is_the_distance_in_pixels():
+    exact = submap()
+    moved = tuple(replace(k, pixels=k.pixels + np.array([3.0, 4.0])) for k in exact.keyframes)
+    np.testing.assert_allclose(replace(exact, keyframes=moved).reprojection_errors(), 5.0)
+
+
+def test_observations_of_lost_points_and_second_observations_are_left_out():
+    whole = submap()
+    keyframe = replace(
+        whole.keyframes[0],
+        point_ids=np.array([100, 555, 99, 100, -1]),
+        pixels=np.arange(10.0).reshape(5, 2),
+    )
+    ids, points, pixels = whole.observed_points(keyframe)
+    np.testing.assert_array_equal(ids, [100, 99])
+    np.testing.assert_array_equal(points, whole.points[:2])
+    np.testing.assert_array_equal(pixels, [[0, 1], [4, 5]])
+
+
+def test_a_keyframe_that_observed_nothing_gives_empty_arrays():
+    whole = submap()
+    blind = replace(whole.keyframes[0], point_ids=np.zeros(0, int), pixels=np.zeros((0, 2)))
+    ids, points, pixels = whole.observed_points(blind)
+    assert (ids.shape, points.shape, pixels.shape) == ((0,), (0, 3), (0, 2))
+    assert replace(whole, keyframes=(blind,)).reprojection_errors().shape == (0,)
+    assert covisibility(replace(whole, keyframes=(blind, whole.keyframes[1]))).tolist() == [[0, 0], [0, 29]]
+
+
+def test_covisibility_counts_the_points_that_two_keyframes_share():
+    whole = submap(n_points=10, n_keyframes=3)
+    assert covisibility(whole).tolist() == [[10, 9, 8], [9, 9, 8], [8, 8, 8]]
+    sets = [set(whole.observed_points(k)[0].tolist()) for k in whole.keyframes]
+    assert covisibility(whole).tolist() == [[len(a & b) for b in sets] for a in sets]
+
+
+def transposed() -> np.ndarray:
+    return pose().T
+
+
+BAD_POSES = {
+    "NaN or infinite": np.full((4, 4), np.nan),
+    r"shape \(3, 4\); expected \(4, 4\)": pose()[:3],
+    "not a rotation": np.diag([2.0, 2, 2, 1]),
+    "det -1": np.diag([1.0, 1, -1, 1]),
+    "column by column": transposed(),
+}
+
+
+@pytest.mark.parametrize("message", BAD_POSES)
+def test_a_keyframe_whose_pose_is_none_is_refused_by_name(message):
+    with pytest.raises(InputError, match=rf"keyframe 0000\.png: .*{message}"):
+        replace(submap().keyframes[0], cam_from_map=BAD_POSES[message])
+
+
+def test_a_pose_of_six_digits_is_good_enough():
+    check_rigid(np.round(pose(3), 6), "keyframe")
+
+
+def test_keypoints_and_point_ids_must_pair_up():
+    with pytest.raises(InputError, match=r"30 keypoints, 29 point ids"):
+        replace(submap().keyframes[0], point_ids=np.arange(29))
+
+
+def with_bad_point() -> np.ndarray:
+    points = submap().points.copy()
+    points[4, 1] = np.nan
+    return points
+
+
+BAD_SUBMAPS = {
+    "map 0 has no points": {"points": np.zeros((0, 3)), "point_ids": np.zeros(0, int)},
+    "map 0 has no keyframes": {"keyframes": ()},
+    "map 0: 1 points are not finite, the first is point 96": {"points": with_bad_point()},
+    "frame 0 is in it twice": {
+        "keyframes": (submap().keyframes[0], replace(submap().keyframes[1], name="0_color.png"))
+    },
+    "mask.png: no number": {"keyframes": (replace(submap().keyframes[0], name="mask.png"),)},
+    "30 points, 29 point ids": {"point_ids": np.arange(29)},
+    "point 7 is in it twice": {"point_ids": np.array([7, *range(100, 128), 7])},
+}
+
+
+@pytest.mark.parametrize("message", BAD_SUBMAPS)
+def test_a_map_that_cannot_be_used_is_refused_by_name(message):
+    with pytest.raises(InputError, match=message):
+        replace(submap(), **BAD_SUBMAPS[message])
+
+
+def test_a_sequence_without_maps_or_with_one_id_twice_is_refused_with_its_source():
+    with pytest.raises(InputError, match="run/output: no map in it"):
+        SparseMap((), "run/output")
+    with pytest.raises(InputError, match="run/output: two maps have the id 3"):
+        SparseMap((submap(id=3), submap(id=1), submap(id=3)), "run/output")
+    assert len(SparseMap((submap(id=3), submap(id=1)), "run/output").submaps) == 2
