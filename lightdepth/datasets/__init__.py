@@ -1,0 +1,8 @@
+"""What is on disk, as frames: open_sequence(path) -> Sequence[Frame]. One module per format, each with its writer."""
+
+from lightdepth.datasets.c3vd import read_c3vd, write_c3vd
+from lightdepth.datasets.folder import read_folder, write_folder
+from lightdepth.datasets.reading import FORMATS, open_sequence
+from lightdepth.datasets.sequence import FrameSequence
+
+__all__ = ["FORMATS", "FrameSequence", "open_sequence", "read_c3vd", "read_folder", "write_c3vd", "write_folder"]

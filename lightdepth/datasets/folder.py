@@ -1,0 +1,117 @@
+"""A folder of frames: images (in `frames/` or directly), camera.json, light.json, mask.png; truth/ where there is any.
+
+truth/distance/NAME.tiff is float32 [mm] along the ray, 0 where unknown; truth/poses.tum holds world_from_cam, one line
+`time tx ty tz qx qy qz qw` per frame in order, millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lightdepth.calibration import read_camera, read_light, write_camera, write_light
+from lightdepth.camera import CameraModel
+from lightdepth.datasets.sequence import FrameSequence, list_images, read_image, read_mask, read_raw
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame
+from lightdepth.photometry import PhotometricCalibration
+
+
+def read_folder(
+    path: Path,
+    camera: CameraModel | None = None,
+    light: PhotometricCalibration | None = None,
+    mask: np.ndarray | None = None,
+) -> FrameSequence:
+    """Frames of a folder. What is given here wins over the files in it; without any camera it is refused."""
+    images = list_images(path / "frames" if (path / "frames").is_dir() else path)
+    if not images:
+        raise InputError(f"{path}: no images with a number in their names; expected frames such as 000123.png")
+    if camera is None:
+        if not (path / "camera.json").is_file():
+            raise InputError(
+                f"{path}: no camera.json; give --camera FILE "
+                '({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), or a map that has one'
+            )
+        camera = read_camera(path / "camera.json")
+    if light is None:
+        light = read_light(path / "light.json") if (path / "light.json").is_file() else PhotometricCalibration()
+    if mask is None and (path / "mask.png").is_file():
+        mask = read_mask(path / "mask.png")
+    truth = path / "truth"
+    times, poses = read_tum(truth / "poses.tum") if (truth / "poses.tum").is_file() else (None, None)
+    if poses is not None and len(poses) != len(images):
+        raise InputError(f"{truth / 'poses.tum'}: {len(poses)} poses for {len(images)} frames; expected one for each")
+
+    def load(i: int) -> Frame:
+        distance = truth / "distance" / f"{images[i].stem}.tiff"
+        return Frame(
+            images[i].stem,
+            read_image(images[i]),
+            camera,
+            light,
+            mask,
+            time=None if times is None else float(times[i]),
+            true_distance=read_raw(distance).astype(np.float32) if distance.is_file() else None,
+            true_world_from_cam=None if poses is None else poses[i],
+        )
+
+    return FrameSequence([p.stem for p in images], load, str(path))
+
+
+def write_folder(frames: Iterable[Frame], path: Path) -> None:
+    """The layout that read_folder reads, with truth where the frames have it."""
+    (path / "frames").mkdir(parents=True)
+    poses, times, first = [], [], None
+    for frame in frames:
+        first = first or frame
+        cv2.imwrite(str(path / "frames" / f"{frame.name}.png"), to_bgr8(frame.image))
+        if frame.true_distance is not None:
+            (path / "truth" / "distance").mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path / "truth" / "distance" / f"{frame.name}.tiff"), frame.true_distance.astype(np.float32))
+        if frame.true_world_from_cam is not None:
+            poses.append(frame.true_world_from_cam)
+            times.append(frame.time or 0.0)
+    if first is None:
+        raise InputError(f"{path}: no frames to write")
+    write_camera(first.camera, path / "camera.json")
+    write_light(first.light, path / "light.json")
+    if first.mask is not None:
+        cv2.imwrite(str(path / "mask.png"), first.mask.astype(np.uint8) * 255)
+    if poses:
+        write_tum(path / "truth" / "poses.tum", times, poses)
+
+
+def to_bgr8(image: np.ndarray) -> np.ndarray:
+    """RGB float in [0, 1] -> BGR uint8 for cv2."""
+    return cv2.cvtColor(np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
+
+
+def write_tum(path: Path, times: Iterable[float], world_from_cam: Iterable[np.ndarray]) -> None:
+    """`t tx ty tz qx qy qz qw`, camera to world."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = []
+    for time, pose in zip(times, world_from_cam, strict=True):
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        lines.append(" ".join([f"{time:.6f}", *(f"{v:.9f}" for v in (*pose[:3, 3], *quaternion))]))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and poses world_from_cam (n, 4, 4) of a TUM trajectory."""
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a TUM trajectory ({error})") from error
+    if rows.shape[1] != 8:
+        raise InputError(f"{path}: {rows.shape[1]} columns; a TUM trajectory has 8: t tx ty tz qx qy qz qw")
+    if not np.isfinite(rows).all():
+        raise InputError(f"{path}: line {int((~np.isfinite(rows)).any(1).argmax()) + 1} has NaN or infinite numbers")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    return rows[:, 0], poses

@@ -1,0 +1,57 @@
+"""open_sequence: whatever is at a path, as frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lightdepth.calibration import read_camera, read_light
+from lightdepth.camera import CameraModel
+from lightdepth.datasets.c3vd import is_c3vd, read_c3vd
+from lightdepth.datasets.folder import read_folder
+from lightdepth.datasets.sequence import FrameSequence, list_images, read_image, read_mask
+from lightdepth.errors import InputError
+from lightdepth.frame import check_image_size
+
+FORMATS = ("folder", "c3vd")
+
+
+def open_sequence(
+    path: str | Path,
+    format: str | None = None,
+    camera: str | Path | None = None,
+    light: str | Path | None = None,
+    mask: str | Path | None = None,
+    map_camera: CameraModel | None = None,
+) -> FrameSequence:
+    """Frames at `path`, of a format found by looking or named; lazy.
+
+    `camera`, `light`, `mask` are files (light also `gamma=2.2,mu=0`) that win over what is in the folder;
+    `map_camera` serves where neither a file nor the format gives a camera.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        found = "is a file" if path.is_file() else "does not exist"
+        raise InputError(f"{path}: {found}; expected a folder of frames")
+    if format is None:
+        format = "c3vd" if is_c3vd(path) else "folder"
+    chosen_light = read_light(light) if light is not None else None
+    chosen_mask = read_mask(Path(mask)) if mask is not None else None
+    chosen = read_camera(Path(camera)) if camera is not None else None
+    if format == "c3vd":
+        return read_c3vd(path, chosen, chosen_light, chosen_mask)
+    if format == "folder":
+        if chosen is None and map_camera is not None and not (path / "camera.json").is_file():
+            chosen = _at_size_of_images(map_camera, path)
+        return read_folder(path, chosen, chosen_light, chosen_mask)
+    raise InputError(f"format {format!r}; expected one of {', '.join(FORMATS)}")
+
+
+def _at_size_of_images(camera: CameraModel, path: Path) -> CameraModel:
+    """A map's camera at the size of the images: a SLAM often works at half size. Cropped images are refused."""
+    images = list_images(path / "frames" if (path / "frames").is_dir() else path)
+    if not images:
+        return camera
+    height, width = read_image(images[0]).shape[:2]
+    if abs(width / camera.width / (height / camera.height) - 1) > 0.01:
+        check_image_size(images[0].name, width, height, camera)
+    return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)

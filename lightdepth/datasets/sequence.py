@@ -1,0 +1,114 @@
+"""A lazy sequence of frames, and how images, masks and truth are read from files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import overload
+
+import cv2
+import numpy as np
+
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame, frame_number
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+
+class FrameSequence(Sequence[Frame]):
+    """Frames by index, each read from disk when it is asked for. `names` and `numbers` cost no reading."""
+
+    def __init__(self, names: Sequence[str], load: Callable[[int], Frame], source: str):
+        if not names:
+            raise InputError(f"{source}: no frames in it; expected images with a number in their names")
+        self.names = list(names)
+        self.numbers = [frame_number(name) for name in names]
+        self.source = source
+        self._load = load
+        twice = {n for n in self.numbers if self.numbers.count(n) > 1} if len(set(self.numbers)) < len(names) else set()
+        if twice:
+            same = [name for name, n in zip(self.names, self.numbers, strict=True) if n == min(twice)]
+            raise InputError(f"{source}: {' and '.join(same)} have the same number; frames are told apart by it")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice) -> FrameSequence: ...
+    def __getitem__(self, index: int | slice) -> Frame | FrameSequence:
+        if isinstance(index, slice):
+            rows = range(len(self))[index]
+            return FrameSequence([self.names[i] for i in rows], lambda i: self._load(rows[i]), self.source)
+        return self._load(range(len(self))[index])
+
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the frames; reads the first."""
+        first = self[0]
+        return first.camera.width, first.camera.height
+
+    def by_number(self, number: int) -> Frame | None:
+        """The frame with this number, or None."""
+        return self[self.numbers.index(number)] if number in self.numbers else None
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Image files with a number in their names, by that number. Masks and thumbnails have none and are left out."""
+    images = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and any(c.isdigit() for c in p.stem)]
+    return sorted(images, key=lambda p: (frame_number(p.name), p.name))
+
+
+def read_image(path: Path) -> np.ndarray:
+    """(H, W, 3) float32 RGB in [0, 1]. 8- and 16-bit files alike."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such image")
+    data = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)
+    if data is None:
+        raise InputError(f"{path}: not a readable image (truncated, or not an image at all)")
+    top = 65535.0 if data.dtype == np.uint16 else 255.0
+    return cv2.cvtColor(data, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(top)
+
+
+def read_raw(path: Path) -> np.ndarray:
+    """The file's own numbers, channels in the file's order (cv2's reversal undone)."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if data is None:
+        raise InputError(f"{path}: not a readable image (truncated, or not an image at all)")
+    return data if data.ndim == 2 else data[..., ::-1]
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """(H, W) bool, True where tissue shows. Files come in both polarities: the centre of the image decides."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such mask")
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if grey is None:
+        raise InputError(f"{path}: not a readable mask; expected an image, white where tissue shows")
+    mask = grey > 127
+    height, width = mask.shape
+    centre = mask[int(height * 0.45) : int(height * 0.55) + 1, int(width * 0.45) : int(width * 0.55) + 1]
+    mask = mask if centre.mean() >= 0.5 else ~mask
+    if mask.all() and not (grey > 127).any():
+        raise InputError(f"{path}: the mask is black everywhere; expected white where tissue shows")
+    return mask
+
+
+def border_mask(images: Sequence[np.ndarray]) -> np.ndarray:
+    """(H, W) bool: what is not the black border, found in images (H, W, 3) of one camera by their brightest values.
+
+    The largest bright region with its holes filled (a dark lumen is tissue too), shrunk by 0.4 % of the height.
+    """
+    bright = np.max([image.max(-1) for image in images], axis=0) > 16 / 255
+    size = max(3, round(0.01 * bright.shape[0])) | 1
+    closed = cv2.morphologyEx(bright.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
+    contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return np.ones(bright.shape, bool)
+    filled = cv2.drawContours(np.zeros_like(closed), [max(contours, key=cv2.contourArea)], -1, 1, cv2.FILLED)
+    shrink = 2 * max(1, round(0.004 * bright.shape[0])) + 1
+    padded = cv2.copyMakeBorder(filled, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    eroded = cv2.erode(padded, np.ones((shrink, shrink), np.uint8), borderValue=1)[1:-1, 1:-1]
+    return eroded.astype(bool)

@@ -1,0 +1,91 @@
+"""How the endoscope moves through a synthetic colon, and which part of the image its optics light."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole, Scaramuzza
+from lightdepth.errors import InputError
+from lightdepth.tube.shape import TubeShape
+
+C3VD = Scaramuzza(
+    1350,
+    1080,
+    678.544839263292,
+    542.975887548343,
+    769.243600037458,
+    0.0,
+    -8.12770624150226e-4,
+    6.25674244578925e-7,
+    -1.19662182144280e-9,
+    0.999986882249990,
+    0.00288273829525059,
+    -0.00296316513429569,
+).with_pixel_center(0.0)
+"""The camera of C3VD, first edition (as its authors' loader has it), at full size."""
+
+
+def lens(kind: str, width: int, height: int) -> CameraModel:
+    """A typical lens: "pinhole" (90 degrees across), "fisheye" (140 degrees corner to corner) or "c3vd"."""
+    centre = (width / 2, height / 2)
+    if kind == "pinhole":
+        return Pinhole(width, height, width / 2, width / 2, *centre)
+    if kind == "fisheye":
+        f = 0.52 * width
+        return KannalaBrandt(width, height, f, f, *centre, -0.13, -0.005, 0.0015, -0.0001)
+    if kind == "c3vd":
+        return C3VD.resized(width, height)
+    raise InputError(f"lens {kind!r}; expected pinhole, fisheye or c3vd")
+
+
+def octagon(camera: CameraModel, cut: float = 0.2) -> np.ndarray:
+    """(H, W) bool: the image without its corners, cut at `cut` of the height; endoscopes mask them."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    from_corner = np.minimum(u, camera.width - u) + np.minimum(v, camera.height - v)
+    return from_corner > cut * camera.height
+
+
+def camera_path(
+    shape: TubeShape, count: int, travel: float, rng: np.random.Generator, start: float | None = None
+) -> np.ndarray:
+    """Poses world_from_cam (count, 4, 4) [mm]: `travel` mm along the tube, with sway and looking about."""
+    length = (len(shape.centers) - 1) * shape.step
+    latest = max(9.0, length - travel - 2.5 * float(shape.radius.mean()))
+    first = rng.uniform(8.0, latest) if start is None else start
+    s = first + np.linspace(0, travel, count)
+    smooth = max(2.0, count / 5)
+
+    def wander(scale: float) -> np.ndarray:
+        noise = gaussian_filter1d(rng.standard_normal(count + 40), smooth)[20:-20]
+        return (
+            scale * (noise / max(noise.std(), 0.3) + rng.normal(0, 0.7)) if count > 1 else scale * rng.normal(0, 1, 1)
+        )
+
+    row = np.clip(s / shape.step, 0, len(shape.centers) - 1)
+    floor = np.minimum(row.astype(int), len(shape.centers) - 2)
+    part = (row - floor)[:, None]
+    radius = shape.radius[floor]
+    side, up = shape.frames[floor, 1], shape.frames[floor, 2]
+    centers = shape.centers[floor] * (1 - part) + shape.centers[floor + 1] * part
+    # Parallel-transported frames turn slowly: interpolate so that the path has no steps.
+    side = side * (1 - part) + shape.frames[floor + 1, 1] * part
+    up = up * (1 - part) + shape.frames[floor + 1, 2] * part
+    sway = np.stack([wander(0.13), wander(0.13)], -1).clip(-0.3, 0.3) * radius[:, None]
+    positions = centers + sway[:, :1] * side + sway[:, 1:] * up
+    ahead = np.minimum(floor + round(18 / shape.step), len(shape.centers) - 1)
+    forward = shape.centers[ahead] - positions
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    look = np.stack([wander(0.12), wander(0.12)], -1)
+    roll = wander(0.15)
+
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for i in range(count):
+        right = np.cross(up[i], forward[i])
+        right /= np.linalg.norm(right)
+        base = np.stack([right, np.cross(forward[i], right), forward[i]], -1)
+        turned = Rotation.from_euler("xyz", [look[i, 0], look[i, 1], roll[i]]).as_matrix()
+        poses[i, :3, :3] = base @ turned
+        poses[i, :3, 3] = positions[i]
+    return poses

@@ -1,0 +1,70 @@
+"""Frames of a synthetic colon with exact distance and pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lightdepth.camera import CameraModel
+from lightdepth.frame import Frame
+from lightdepth.photometry import PhotometricCalibration
+from lightdepth.tube.path import camera_path, lens, octagon
+from lightdepth.tube.scene import Tube, TubeConfig
+
+
+@dataclass(frozen=True)
+class TubeSequence:
+    """Rendered frames and the colon they were rendered from."""
+
+    frames: list[Frame]
+    tube: Tube
+
+
+def render_sequence(
+    seed: int,
+    count: int,
+    camera: CameraModel,
+    travel: float = 25.0,
+    config: TubeConfig | None = None,
+    light: PhotometricCalibration | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> TubeSequence:
+    """A colon drawn from `seed`, seen in `count` frames along `travel` mm. Frames carry the light's true calibration
+    with gain 1 (exposure is automatic, so the true gain differs per frame), distance and pose in mm."""
+    rng = np.random.default_rng(seed)
+    tube = Tube(config or TubeConfig(), rng, light)
+    mask = octagon(camera)
+    frames = []
+    for i, pose in enumerate(camera_path(tube.shape, count, travel, rng)):
+        view = tube.view(pose, camera, mask, rng)
+        frames.append(
+            Frame(
+                f"{i:06d}",
+                view.image,
+                camera,
+                replace(tube.light, gain=1.0),
+                mask,
+                time=i / 30.0,
+                true_distance=view.distance,
+                true_world_from_cam=pose,
+            )
+        )
+        if progress is not None:
+            progress(i + 1, count)
+    return TubeSequence(frames, tube)
+
+
+def tube_frames(
+    seed: int,
+    count: int,
+    camera: CameraModel | None = None,
+    travel: float = 60.0,
+    config: TubeConfig | None = None,
+    light: PhotometricCalibration | None = None,
+) -> list[Frame]:
+    """Frames for training: `count` views spread over `travel` mm of one colon (C3VD's lens at 160x128 by default)."""
+    camera = camera or lens("c3vd", 160, 128)
+    frames = render_sequence(seed, count, camera, travel, config, light).frames
+    return [replace(frame, name=f"tube{seed}_{frame.name}") for frame in frames]

@@ -1,0 +1,124 @@
+"""The shape of a synthetic colon: a bent tube with haustral folds, as a grid mesh over (s, phi).
+
+Notation: s arc length along the centreline [mm], phi angle around it; the mesh is a grid of rings (rows, along s) and
+spokes (columns, along phi; the last column continues at the first). Lengths in millimetres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+
+@dataclass(frozen=True)
+class ShapeConfig:
+    """What a colon may look like; pairs are the ends of a uniform range. Lengths in mm."""
+
+    length: float = 150.0
+    radius: tuple[float, float] = (15.0, 25.0)
+    bend: tuple[float, float] = (0.0, 0.9)  # how far the direction swings along the tube, radians
+    fold_spacing: tuple[float, float] = (11.0, 24.0)
+    fold_depth: tuple[float, float] = (0.12, 0.38)  # share of the radius
+    fold_width: tuple[float, float] = (1.6, 3.2)
+    bump: tuple[float, float] = (0.01, 0.05)  # share of the radius, undulation between the folds
+    step: float = 0.8  # grid spacing
+
+
+@dataclass(frozen=True)
+class TubeShape:
+    """centers (R, 3) and frames (R, 3, 3: tangent, side, up) of the rings; vertices and unit normals (R, C, 3), normals
+    pointing into the lumen; radius (R,) the mean radius of each ring."""
+
+    centers: np.ndarray
+    frames: np.ndarray
+    vertices: np.ndarray
+    normals: np.ndarray
+    radius: np.ndarray
+    step: float
+
+    @property
+    def faces(self) -> np.ndarray:
+        """Triangles (n, 3) over the flattened grid; two per cell, in order of the cells, wrapping around the tube."""
+        rings, spokes = self.vertices.shape[:2]
+        i, j = np.meshgrid(np.arange(rings - 1), np.arange(spokes), indexing="ij")
+        a, b = i * spokes + j, i * spokes + (j + 1) % spokes
+        c, d = a + spokes, b + spokes
+        return np.stack([np.stack([a, b, c], -1), np.stack([b, d, c], -1)], 2).reshape(-1, 3)
+
+
+def smooth_noise(shape: tuple[int, int], sigma: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
+    """Noise of unit deviation over (s, phi), smooth over sigma cells, periodic in phi."""
+    noise = gaussian_filter(rng.standard_normal(shape), sigma, mode=("nearest", "wrap"))
+    return noise / max(noise.std(), 1e-12)
+
+
+def make_shape(config: ShapeConfig, rng: np.random.Generator) -> TubeShape:
+    """A random colon. The far end is closed, so that every ray into the scene meets the wall."""
+    rings = round(config.length / config.step) + 1
+    s = np.arange(rings) * config.step
+    mean_radius = rng.uniform(*config.radius)
+    spokes = 8 * round(2 * np.pi * mean_radius / config.step / 8)
+    phi = np.arange(spokes) * 2 * np.pi / spokes
+
+    centers, frames = _centreline(s, rng.uniform(*config.bend), rng)
+    profile = 1 + 0.12 * np.interp(s, np.linspace(0, config.length, 6), rng.standard_normal(6))
+    profile = gaussian_filter(profile, 8 / config.step)
+    relative = profile[:, None] * np.ones(spokes)
+    sigma = 5.0 / config.step
+    relative += rng.uniform(*config.bump) * smooth_noise((rings, spokes), (sigma, sigma), rng)
+    relative -= _folds(s, phi, config, rng)
+
+    # Close the far end with a half ellipse.
+    end = 0.6 * mean_radius
+    closing = np.sqrt(np.clip(1 - ((s - (config.length - end)) / end).clip(min=0) ** 2, 0, 1))
+    relative = relative.clip(min=0.3) * np.maximum(closing, 1e-3)[:, None]
+    radius = mean_radius * relative
+
+    side = np.cos(phi)[:, None] * frames[:, None, 1] + np.sin(phi)[:, None] * frames[:, None, 2]
+    vertices = centers[:, None] + radius[..., None] * side
+    along_s = np.gradient(vertices, axis=0)
+    wrapped = np.concatenate([vertices[:, -1:], vertices, vertices[:, :1]], 1)
+    along_phi = (wrapped[:, 2:] - wrapped[:, :-2]) / 2
+    normals = np.cross(along_s, along_phi)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-12)
+    inward = np.sign((normals * -side).sum(-1).mean())
+    return TubeShape(centers, frames, vertices, normals * inward, radius.mean(1), config.step)
+
+
+def _centreline(s: np.ndarray, swing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth curve by arc length with parallel-transported frames."""
+    knots = np.linspace(s[0], s[-1], 5)
+    angles = [gaussian_filter(np.interp(s, knots, swing * rng.uniform(-1, 1, 5)), len(s) / 12) for _ in range(2)]
+    yaw, pitch = (a - a[0] for a in angles)
+    tangent = np.stack([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)], -1)
+    step = s[1] - s[0]
+    centers = np.concatenate([[np.zeros(3)], np.cumsum((tangent[1:] + tangent[:-1]) / 2 * step, 0)])
+    side = np.empty_like(tangent)
+    side[0] = np.cross((0.0, 1.0, 0.0), tangent[0])
+    for i in range(1, len(s)):
+        side[i] = side[i - 1] - (side[i - 1] @ tangent[i]) * tangent[i]
+        side[i] /= np.linalg.norm(side[i])
+    side[0] /= np.linalg.norm(side[0])
+    return centers, np.stack([tangent, side, np.cross(tangent, side)], 1)
+
+
+def _folds(s: np.ndarray, phi: np.ndarray, config: ShapeConfig, rng: np.random.Generator) -> np.ndarray:
+    """How far the folds reach into the lumen, as a share of the radius (R, C).
+
+    Each is a ring of narrow profile, tilted, and strong between the three taeniae, weak on them.
+    """
+    total = np.zeros((len(s), len(phi)))
+    taenia = rng.uniform(0, 2 * np.pi)
+    position = rng.uniform(2, 10)
+    while position < s[-1]:
+        tilt = rng.uniform(-2.5, 2.5) * np.cos(phi - rng.uniform(0, 2 * np.pi))
+        lobes = 0.55 + 0.45 * np.cos(3 * (phi - taenia) + rng.normal(0, 0.3))
+        one_sided = 1 + 0.35 * np.cos(phi - rng.uniform(0, 2 * np.pi))
+        depth = rng.uniform(*config.fold_depth) * lobes * one_sided
+        width = rng.uniform(*config.fold_width)
+        offset = (s[:, None] - position - tilt) / width
+        total = np.maximum(total, depth * np.exp(-(np.abs(offset) ** 1.6)))
+        position += rng.uniform(*config.fold_spacing)
+    return total

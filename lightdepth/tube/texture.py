@@ -1,0 +1,76 @@
+"""What is painted on the wall: mucosa colour, mottling, vessels. Maps over (s, phi), periodic in phi."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from lightdepth.tube.shape import smooth_noise
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """Ranges of the wall's appearance."""
+
+    hue: tuple[float, float] = (-0.03, 0.06)  # turns of the colour circle; 0 is red
+    saturation: tuple[float, float] = (0.3, 0.65)
+    mottling: tuple[float, float] = (0.02, 0.08)  # deviation of saturation
+    value: tuple[float, float] = (0.0, 0.12)  # how much darker the darkest spots are: what LightDepth assumes to be 0
+    vessels: tuple[int, int] = (10, 45)
+    resolution: float = 0.14  # mm per texel along s
+
+
+def make_texture(length: float, circumference: float, config: TextureConfig, rng: np.random.Generator) -> np.ndarray:
+    """Albedo (rows along s, columns along phi, 3) float32 RGB in [0, 1]."""
+    rows, columns = round(length / config.resolution), round(circumference / config.resolution)
+    coarse = (rows // 6, columns // 6)
+
+    def noise(scale_mm: float) -> np.ndarray:
+        sigma = scale_mm / config.resolution / 6
+        field = smooth_noise(coarse, (sigma, sigma), rng).astype(np.float32)
+        padded = np.concatenate([field, field[:, :1]], 1)
+        return cv2.resize(padded, (columns, rows), interpolation=cv2.INTER_LINEAR)
+
+    hue = rng.uniform(*config.hue) + 0.012 * noise(6)
+    mottling = rng.uniform(*config.mottling)
+    saturation = rng.uniform(*config.saturation) + mottling * (noise(8) + 0.7 * noise(1.5))
+    fine = smooth_noise((rows // 2, columns // 2), (1.2, 1.2), rng).astype(np.float32)
+    saturation += 0.5 * mottling * cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    darker = rng.uniform(*config.value)
+    value = 1 - darker * np.clip(0.5 + 0.35 * noise(3), 0, 1)
+
+    vessels = _vessels((rows, columns), int(rng.integers(config.vessels[0], config.vessels[1] + 1)), config, rng)
+    saturation = np.clip(saturation + 0.25 * vessels, 0.02, 0.95)
+    value = value * (1 - 0.25 * vessels * min(1.0, darker * 10))
+    hsv = np.stack([(hue % 1.0) * 360, saturation, value], -1).astype(np.float32)
+    return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)
+
+
+def _vessels(shape: tuple[int, int], count: int, config: TextureConfig, rng: np.random.Generator) -> np.ndarray:
+    """Branching lines that thin out, 0..1."""
+    rows, columns = shape
+    canvas = np.zeros(shape, np.float32)
+    step = 0.8 / config.resolution
+    stems = [
+        (rng.uniform(0, rows), rng.uniform(0, columns), rng.uniform(0, 2 * np.pi), rng.uniform(0.25, 0.7), 0)
+        for _ in range(count)
+    ]
+    while stems:
+        y, x, angle, width, depth = stems.pop()
+        line = [(x, y)]
+        for _ in range(int(rng.integers(12, 45))):
+            angle += rng.normal(0, 0.22)
+            x, y = x + step * np.cos(angle), y + step * np.sin(angle)
+            line.append((x, y))
+            if depth < 3 and rng.random() < 0.06:
+                stems.append((y, x, angle + rng.choice([-1, 1]) * rng.uniform(0.4, 1.0), width * 0.7, depth + 1))
+        points = np.array(line)
+        thickness = max(1, round(width / config.resolution))
+        for shift in (-columns, 0, columns):
+            shifted = np.rint((points + (shift, 0)) * 16).astype(np.int32)
+            strength = float(0.4 + 0.6 * width / 0.7)
+            cv2.polylines(canvas, [shifted], False, strength, thickness, cv2.LINE_AA, shift=4)
+    return gaussian_filter(canvas, 1.0, mode=("nearest", "wrap")).clip(0, 1)
