@@ -1,0 +1,121 @@
+"""Whether a map's numbers agree with each other.
+
+The reprojection error of the map's own observations tells a wrong reading from a right one: read as they should be,
+real maps have about a pixel; read with the poses inverted, a hundred. When a map does not fit, the other readings that
+occur in practice are tried and the one that fits is named. None is ever taken silently: what fits may still be a
+coincidence, and the user has to know what her files say.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lightdepth.camera import CameraModel
+from lightdepth.errors import InputError
+from lightdepth.maps.convention import SIDECAR, distorted
+from lightdepth.sparse_map import Keyframe, Submap
+
+MAX_MEDIAN_PX = 5.0
+_MIN_SHARE_IN_VIEW = 0.5
+
+
+def reprojection(submap: Submap) -> tuple[float, float]:
+    """Median reprojection error [px] of the observations whose point is in view, and the share of those that are."""
+    errors = submap.reprojection_errors()
+    observations = sum(len(submap.observed_points(k)[0]) for k in submap.keyframes)
+    return (float(np.median(errors)) if len(errors) else np.inf), len(errors) / max(observations, 1)
+
+
+def checked(submap: Submap, where: Path) -> Submap:
+    """The submap, if its observations agree with its poses, points and cameras.
+
+    Raises InputError when they do not but would under another reading, which is named; warns when none is found.
+    A submap without any observation gets them by projection, with a warning and `weak_visibility` set.
+    """
+    if not any(len(submap.observed_points(k)[0]) for k in submap.keyframes):
+        submap = seen_by_projection(submap)
+        warnings.warn(
+            f"{where}: no keyframe says which points it observed; taken to be every point in its view, hidden ones "
+            "included. Alignment will be weaker: export the keypoints with their point ids if you can",
+            stacklevel=2,
+        )
+        return submap
+    median, share = reprojection(submap)
+    if median <= MAX_MEDIAN_PX and share >= _MIN_SHARE_IN_VIEW:
+        return submap
+    found = f"{where}: median reprojection error {median:.1f} px, {share:.0%} of the observations in view"
+    fits = {what: reprojection(other(submap)) for what, other in _OTHER_READINGS.items()}
+    fits = {what: fit for what, fit in fits.items() if fit[0] < MAX_MEDIAN_PX and fit[1] >= _MIN_SHARE_IN_VIEW}
+    if fits:
+        best = min(fits, key=lambda what: fits[what][0])
+        raise InputError(f"{found}; it would be {fits[best][0]:.2f} px {best}")
+    warnings.warn(
+        f"{found}; expected about 1 px, at most {MAX_MEDIAN_PX:g}. Inverse poses, half and double camera size, "
+        "quaternion order and undistorted keypoints do not explain it: check that cameras, images and points3D belong "
+        "together",
+        stacklevel=2,
+    )
+    return submap
+
+
+def seen_by_projection(submap: Submap) -> Submap:
+    """The submap with every point in a keyframe's view counted as observed at its projection, hidden or not."""
+    keyframes = []
+    for keyframe in submap.keyframes:
+        pixels, valid = keyframe.camera.project(keyframe.in_camera(submap.points))
+        keyframes.append(replace(keyframe, pixels=pixels[valid], point_ids=submap.point_ids[valid]))
+    if not any(len(k.point_ids) for k in keyframes):
+        raise InputError(
+            f"map {submap.id}: no keyframe observed a point, and none has a point in its view; are the poses "
+            "camera-from-map (w2c), and do points and poses belong to the same map?"
+        )
+    return replace(submap, keyframes=tuple(keyframes), weak_visibility=True)
+
+
+def _each(change: Callable[[Keyframe], Keyframe]) -> Callable[[Submap], Submap]:
+    return lambda submap: replace(submap, keyframes=tuple(change(k) for k in submap.keyframes))
+
+
+def _inverse(keyframe: Keyframe) -> Keyframe:
+    return replace(keyframe, cam_from_map=np.linalg.inv(keyframe.cam_from_map))
+
+
+def _scalar_last(keyframe: Keyframe) -> Keyframe:
+    """The pose, had its quaternion been written x y z w and read w x y z: first the numbers read, then their order."""
+    x, y, z, w = Rotation.from_matrix(keyframe.cam_from_map[:3, :3]).as_quat(scalar_first=True)
+    pose = keyframe.cam_from_map.copy()
+    pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    return replace(keyframe, cam_from_map=pose)
+
+
+def _size(scale: float) -> Callable[[Keyframe], Keyframe]:
+    def change(keyframe: Keyframe) -> Keyframe:
+        camera: CameraModel = keyframe.camera
+        return replace(keyframe, camera=camera.resized(round(camera.width * scale), round(camera.height * scale)))
+
+    return change
+
+
+def _undistorted(keyframe: Keyframe) -> Keyframe:
+    return replace(keyframe, pixels=distorted(keyframe.camera, keyframe.pixels))
+
+
+_OTHER_READINGS: dict[str, Callable[[Submap], Submap]] = {
+    "with the inverse poses. Poses are taken as camera-from-map (w2c) unless declared otherwise: invert them, or set "
+    f'"pose_convention" to "w2c" or "c2w", whichever it is, in {SIDECAR} beside the files': _each(_inverse),
+    "with the quaternions read as x y z w. Write them as w x y z": _each(_scalar_last),
+    "with the inverse poses and the quaternions read as x y z w, as TUM has them. "
+    "Write camera-from-map (w2c) poses as w x y z": _each(lambda k: _inverse(_scalar_last(k))),
+    "with the camera at half its size: the keypoints are those of images half as large. "
+    "Correct the size and intrinsics in the cameras file": _each(_size(0.5)),
+    "with the camera at double its size: the keypoints are those of images twice as large. "
+    "Correct the size and intrinsics in the cameras file": _each(_size(2.0)),
+    "with undistorted keypoints. Export the distorted ones, or put "
+    f'{{"keypoints": "undistorted"}} into {SIDECAR} beside the files': _each(_undistorted),
+}

@@ -1,0 +1,404 @@
+"""COLMAP models: cameras, images and points3D, as .txt or .bin.
+
+Written for what is found in the wild: with and without the rigs and frames files of COLMAP 3.12 and later (the poses in
+the images file are complete without them), ids from 0, points without tracks, points without colour or error. What a
+keyframe observed is taken from the images file alone. Pixels and poses are COLMAP's unless a `MapConvention` says
+otherwise.
+
+Formats: COLMAP documentation, "Output format".
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lightdepth.camera import CameraModel, camera_from_params
+from lightdepth.errors import InputError
+from lightdepth.maps.checks import checked
+from lightdepth.maps.convention import COLMAP, MapConvention
+from lightdepth.sparse_map import Keyframe, Submap
+
+PARTS = ("cameras", "images", "points3D")
+
+_BINARY_MODELS = {  # model number in cameras.bin -> name, number of parameters
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}
+_NO_POINT = 2**63  # COLMAP's invalid id is 2^64 - 1; text says -1
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """One image as the file has it: pose (4, 4), and the keypoints (n, 2) that belong to a point, with its id (n,)."""
+
+    name: str
+    camera_id: int
+    pose: np.ndarray
+    pixels: np.ndarray
+    point_ids: np.ndarray
+
+
+def holds_model(folder: Path) -> bool:
+    """Whether any of a model's files lies in the folder."""
+    return any((folder / f"{part}{suffix}").is_file() for part in PARTS for suffix in (".txt", ".bin"))
+
+
+def read_submap(folder: Path, map_id: int, convention: MapConvention = COLMAP) -> Submap:
+    """One model folder -> submap, keyframes by frame number and points by id.
+
+    Raises InputError, naming file and line, for whatever cannot be read or does not fit together.
+    """
+    suffix = _suffix(folder)
+    paths = {part: folder / f"{part}{suffix}" for part in PARTS}
+    if suffix == ".bin":
+        cameras, images = read_cameras_binary(paths["cameras"]), _read_images_binary(paths["images"])
+        ids, points = _read_points_binary(paths["points3D"])
+    else:
+        cameras, images = read_cameras_text(paths["cameras"]), _read_images_text(paths["images"])
+        ids, points = read_points_text(paths["points3D"])
+    if not images:
+        raise InputError(f"{paths['images']}: no images in it; an empty map cannot be densified, leave it out")
+    keyframes = []
+    for image in images:
+        if image.camera_id not in cameras:
+            raise InputError(
+                f"{paths['images']}: image {image.name} has camera {image.camera_id}; "
+                f"{paths['cameras'].name} has {', '.join(map(str, cameras)) or 'none'}"
+            )
+        keyframes.append(
+            convention.keyframe(image.name, cameras[image.camera_id], image.pose, image.pixels, image.point_ids)
+        )
+    return assembled(folder, map_id, keyframes, ids, points)
+
+
+def assembled(folder: Path, map_id: int, keyframes: list[Keyframe], ids: np.ndarray, points: np.ndarray) -> Submap:
+    """The checked submap of keyframes, point ids (n,) and points (n, 3); every error names the folder."""
+    if not len(points):
+        raise InputError(f"{folder}: no points in points3D; an empty map cannot be densified, leave it out")
+    order = np.argsort(ids, kind="stable")
+    ids, points = ids[order], points[order]
+    twice = ids[1:][ids[1:] == ids[:-1]]
+    if len(twice):
+        raise InputError(f"{folder}: point {twice[0]} is in points3D twice; every point needs its own id")
+    try:
+        submap = Submap(map_id, tuple(sorted(keyframes, key=lambda k: k.number)), ids, points)
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from error
+    return checked(submap, folder)
+
+
+def _suffix(folder: Path) -> str:
+    """Which of the two forms to read: binary where it is complete, as COLMAP does."""
+    missing = {s: [f"{p}{s}" for p in PARTS if not (folder / f"{p}{s}").is_file()] for s in (".bin", ".txt")}
+    for suffix, absent in missing.items():
+        if not absent:
+            return suffix
+    absent = min(missing.values(), key=len)
+    raise InputError(
+        f"{folder}: {' and '.join(absent)} missing; a model is cameras, images and points3D, all .txt or all .bin"
+    )
+
+
+# ---- text
+
+
+def text_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").split("\n")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file; a binary model's files end in .bin") from error
+
+
+def is_comment(line: str) -> bool:
+    """Whether a line says nothing: empty, or a comment."""
+    return not line.strip() or line.lstrip().startswith("#")
+
+
+def _entries(path: Path) -> Iterator[tuple[int, str]]:
+    """Numbered lines that are neither empty nor a comment."""
+    return (
+        (n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and not line.lstrip().startswith("#")
+    )
+
+
+def parse_numbers(tokens: list[str], where: str, expected: str) -> np.ndarray:
+    """Tokens as float64; raises InputError with the first that is not a number."""
+    try:
+        return np.array(tokens, dtype=np.float64)
+    except ValueError:
+        for token in tokens:
+            try:
+                float(token)
+            except ValueError:
+                raise InputError(f"{where}: found {token!r}, which is not a number; expected {expected}") from None
+        raise
+
+
+def _integer(token: str, where: str, expected: str) -> int:
+    try:
+        return int(token)
+    except ValueError:
+        raise InputError(f"{where}: found {token!r}, which is not an integer; expected {expected}") from None
+
+
+def read_cameras_text(path: Path) -> dict[int, CameraModel]:
+    """Cameras by id, in the file's own pixel convention."""
+    expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
+    cameras = {}
+    for number, line in _entries(path):
+        where, tokens = f"{path}, line {number}", line.split()
+        if len(tokens) < 5:
+            raise InputError(f"{where}: found {line.strip()[:60]!r}; expected {expected}")
+        camera_id, width, height = (_integer(tokens[k], where, expected) for k in (0, 2, 3))
+        params = parse_numbers(tokens[4:], where, expected).tolist()
+        cameras[camera_id] = camera_from_params(tokens[1], width, height, params, where)
+    if not cameras:
+        raise InputError(f"{path}: no camera in it; expected a line {expected}")
+    return cameras
+
+
+def _read_images_text(path: Path) -> list[ModelImage]:
+    expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+    images = []
+    lines = iter(enumerate(text_lines(path), 1))
+    for number, line in lines:
+        if is_comment(line):
+            continue
+        where, tokens = f"{path}, line {number}", line.split(None, 9)
+        if len(tokens) < 10:
+            raise InputError(f"{where}: found {line.strip()[:60]!r}; expected {expected}, then a line of keypoints")
+        _integer(tokens[0], where, expected)
+        camera_id, name = _integer(tokens[8], where, expected), tokens[9].strip()
+        numbers = parse_numbers(tokens[1:8], where, expected)
+        pose = pose_from_quaternion(numbers[:4], numbers[4:], f"{where}: image {name}")
+        number, line = next(lines, (number + 1, ""))  # the second line may be empty, but belongs to the image
+        where, triples = f"{path}, line {number}", "X Y POINT3D_ID, repeated"
+        keypoints = parse_numbers(line.split(), where, f"{triples} (the keypoints of {name})")
+        if len(keypoints) % 3:
+            raise InputError(
+                f"{where}: {len(keypoints)} numbers; expected {triples}: the keypoints of {name}, or an empty line"
+            )
+        keypoints = keypoints.reshape(-1, 3)
+        keypoints = keypoints[(keypoints[:, 2] >= 0) & (keypoints[:, 2] < _NO_POINT)]
+        if not np.isfinite(keypoints).all():
+            raise InputError(f"{where}: NaN or infinite keypoints of {name}; expected pixels")
+        images.append(ModelImage(name, camera_id, pose, keypoints[:, :2].copy(), keypoints[:, 2].astype(np.int64)))
+    return images
+
+
+def read_points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Point ids (n,) and points (n, 3). Colour, error and track may be missing, and are not used."""
+    expected = "POINT3D_ID X Y Z [R G B ERROR TRACK...]"
+    entries = [(number, line.split(None, 4)[:4]) for number, line in _entries(path)]
+    try:
+        ids = np.array([tokens[0] for _, tokens in entries], dtype=np.int64)
+        points = np.array([tokens[1:] for _, tokens in entries], dtype=np.float64).reshape(-1, 3)
+    except (ValueError, OverflowError):
+        for number, tokens in entries:
+            where = f"{path}, line {number}"
+            if len(tokens) < 4:
+                raise InputError(f"{where}: found {' '.join(tokens)!r}; expected {expected}") from None
+            _integer(tokens[0], where, expected)
+            parse_numbers(tokens[1:], where, expected)
+        raise
+    bad = np.flatnonzero(~np.isfinite(points).all(1))
+    if len(bad):
+        raise InputError(
+            f"{path}, line {entries[bad[0]][0]}: point {ids[bad[0]]} is not finite ({len(bad)} such); "
+            "expected finite X Y Z"
+        )
+    return ids, points
+
+
+def pose_from_quaternion(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
+    """(4, 4) from a quaternion (w, x, y, z) and a translation (3,)."""
+    if not (np.isfinite(quaternion).all() and np.isfinite(translation).all()):
+        raise InputError(f"{where}: the pose has NaN or infinite numbers; leave out what was not localised")
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > 1e-2:
+        raise InputError(f"{where}: quaternion of norm {norm:.4g}; expected 1 (order w x y z)")
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    pose[:3, 3] = translation
+    return pose
+
+
+def quaternion_from_pose(pose: np.ndarray) -> np.ndarray:
+    """Unit quaternion (w, x, y, z), w >= 0, of a pose's rotation."""
+    return Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True, scalar_first=True)
+
+
+# ---- binary
+
+
+class _Bytes:
+    """A file's bytes, taken in order; little-endian."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.at = path, 0
+        try:
+            self.data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+    def take(self, layout: str) -> tuple:
+        size = struct.calcsize("<" + layout)
+        return struct.unpack("<" + layout, self._next(size))
+
+    def array(self, dtype: np.dtype, count: int) -> np.ndarray:
+        return np.frombuffer(self._next(dtype.itemsize * count), dtype)
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise self._short()
+        name = self._next(end + 1 - self.at)[:-1]
+        try:
+            return name.decode()
+        except UnicodeDecodeError as error:
+            raise InputError(
+                f"{self.path}: an image name is not text at byte {self.at}; not a COLMAP binary file?"
+            ) from error
+
+    def end(self) -> None:
+        if self.at != len(self.data):
+            raise InputError(
+                f"{self.path}: {len(self.data) - self.at} bytes too many; not a COLMAP binary file of this kind"
+            )
+
+    def _next(self, size: int) -> bytes:
+        if self.at + size > len(self.data):
+            raise self._short()
+        self.at += size
+        return self.data[self.at - size : self.at]
+
+    def _short(self) -> InputError:
+        return InputError(
+            f"{self.path}: ends too early, at byte {len(self.data)}; copied incompletely, or not COLMAP's?"
+        )
+
+
+def read_cameras_binary(path: Path) -> dict[int, CameraModel]:
+    data, cameras = _Bytes(path), {}
+    for _ in range(data.take("Q")[0]):
+        camera_id, model, width, height = data.take("IiQQ")
+        if model not in _BINARY_MODELS:
+            known = ", ".join(name for name, _ in _BINARY_MODELS.values())
+            raise InputError(f"{path}: camera {camera_id} has the unknown model number {model}; known are {known}")
+        name, count = _BINARY_MODELS[model]
+        cameras[camera_id] = camera_from_params(name, width, height, list(data.take(f"{count}d")), str(path))
+    data.end()
+    return cameras
+
+
+def _read_images_binary(path: Path) -> list[ModelImage]:
+    keypoint = np.dtype([("xy", "<f8", 2), ("id", "<u8")])
+    data, images = _Bytes(path), []
+    for _ in range(data.take("Q")[0]):
+        numbers = data.take("I7dI")
+        name = data.text()
+        pose = pose_from_quaternion(np.array(numbers[1:5]), np.array(numbers[5:8]), f"{path}: image {name}")
+        found = data.array(keypoint, data.take("Q")[0])
+        found = found[found["id"] < _NO_POINT]
+        if not np.isfinite(found["xy"]).all():
+            raise InputError(f"{path}: NaN or infinite keypoints of {name}; expected pixels")
+        images.append(ModelImage(name, numbers[8], pose, found["xy"].copy(), found["id"].astype(np.int64)))
+    data.end()
+    return images
+
+
+def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    data, ids, points = _Bytes(path), [], []
+    for _ in range(data.take("Q")[0]):
+        point_id, *xyz = data.take("Q3d")
+        data.take("3Bd")
+        data.array(np.dtype("<u4"), 2 * data.take("Q")[0])
+        ids.append(point_id)
+        points.append(xyz)
+    data.end()
+    if ids and max(ids) >= _NO_POINT:
+        raise InputError(f"{path}: point id {max(ids)}; expected ids below 2^63")
+    return np.array(ids, np.int64), np.array(points, np.float64).reshape(-1, 3)
+
+
+# ---- writing
+
+
+def write_text_model(submap: Submap, folder: Path, images: Mapping[str, np.ndarray] | None = None) -> None:
+    """A submap as a COLMAP text model with proper tracks, exact to the last bit; `folder` is made.
+
+    `images` by keyframe name, (H, W, 3) RGB in [0, 1], give the points their colour; without them points are grey.
+    SCARAMUZZA is written under its own name, which `read_map` reads and COLMAP does not know.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = list(dict.fromkeys(k.camera for k in submap.keyframes))
+    camera_lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
+    for camera_id, camera in enumerate(cameras, 1):
+        numbers = " ".join(repr(float(p)) for p in camera.params)
+        camera_lines.append(f"{camera_id} {camera.name} {camera.width} {camera.height} {numbers}")
+    (folder / "cameras.txt").write_text("\n".join(camera_lines) + "\n")
+
+    row = {int(i): r for r, i in enumerate(submap.point_ids.tolist())}
+    errors, colors = _looks(submap, row, images or {})
+    tracks: list[list[tuple[int, int]]] = [[] for _ in row]
+    image_lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# X Y POINT3D_ID ..."]
+    for image_id, keyframe in enumerate(submap.keyframes, 1):
+        quaternion, translation = quaternion_from_pose(keyframe.cam_from_map), keyframe.cam_from_map[:3, 3]
+        pose = " ".join(repr(float(v)) for v in (*quaternion, *translation))
+        image_lines.append(f"{image_id} {pose} {cameras.index(keyframe.camera) + 1} {keyframe.name}")
+        words = []
+        for index, ((u, v), point_id) in enumerate(
+            zip(keyframe.pixels.tolist(), keyframe.point_ids.tolist(), strict=True)
+        ):
+            words.append(f"{u!r} {v!r} {point_id if point_id in row else -1}")
+            if point_id in row:
+                tracks[row[point_id]].append((image_id, index))
+        image_lines.append(" ".join(words))
+    (folder / "images.txt").write_text("\n".join(image_lines) + "\n")
+
+    point_lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX"]
+    for point_id, r in row.items():
+        xyz = " ".join(repr(float(v)) for v in submap.points[r])
+        color = " ".join(str(int(c)) for c in colors[r])
+        track = " ".join(f"{i} {k}" for i, k in tracks[r])
+        point_lines.append(f"{point_id} {xyz} {color} {float(errors[r])!r} {track}".rstrip())
+    (folder / "points3D.txt").write_text("\n".join(point_lines) + "\n")
+
+
+def _looks(submap: Submap, row: dict[int, int], images: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Each point's mean reprojection error [px] (n,), and colour (n, 3) in 0..255, over the keyframes that saw it."""
+    errors, sightings = np.zeros(len(row)), np.zeros(len(row))
+    colors, colored = np.zeros((len(row), 3)), np.zeros(len(row))
+    for keyframe in submap.keyframes:
+        ids, points, pixels = submap.observed_points(keyframe)
+        rows = np.array([row[i] for i in ids.tolist()], dtype=int)
+        projected = keyframe.camera.project(keyframe.in_camera(points))[0]
+        errors[rows] += np.linalg.norm(projected - pixels, axis=1)
+        sightings[rows] += 1
+        image = images.get(keyframe.name)
+        if image is not None:
+            height, width = image.shape[:2]
+            u, v = (np.clip(pixels[:, k].astype(int), 0, n - 1) for k, n in enumerate((width, height)))
+            colors[rows] += image[v, u]
+            colored[rows] += 1
+    mean = np.where(colored[:, None] > 0, colors / np.maximum(colored, 1)[:, None], 0.5)
+    return errors / np.maximum(sightings, 1), np.rint(255 * np.clip(mean, 0, 1)).astype(int)

@@ -1,0 +1,96 @@
+"""What the numbers of a map mean, and how they become ours.
+
+Ours: the first pixel's centre is at (0.5, 0.5), poses are camera-from-map, keypoints are where the lens put them. A
+file named `densify_map.json` beside a map declares what differs from the format's habit. What it says is taken at its
+word: half a pixel hardly shows in the reprojection error, so it has to be declared and cannot be guessed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+
+from lightdepth.calibration import read_json
+from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
+from lightdepth.errors import InputError
+from lightdepth.frame import frame_number
+from lightdepth.sparse_map import Keyframe
+
+SIDECAR = "densify_map.json"
+
+
+@dataclass(frozen=True)
+class MapConvention:
+    """How to read one map's files."""
+
+    pixel_center: float = (
+        0.5  # coordinate of the first pixel's centre, of keypoints and principal point alike: 0.0 or 0.5
+    )
+    pose_convention: str = "w2c"  # direction of the poses in images.txt: "w2c" camera-from-map, "c2w" map-from-camera
+    keypoints: str = "distorted"  # "undistorted": keypoints as a pinhole camera of the same K would see them
+    frame_offset: int = 0  # added to the number in a keyframe's name, where names do not count as the frames do
+
+    def keyframe(
+        self, name: str, camera: CameraModel, pose: np.ndarray, pixels: np.ndarray, ids: np.ndarray
+    ) -> Keyframe:
+        """A keyframe in our conventions from a file's camera, pose (4, 4), keypoints (n, 2) and point ids (n,)."""
+        if self.keypoints == "undistorted":
+            pixels = distorted(camera, pixels)
+        if self.pose_convention == "c2w":
+            pose = np.linalg.inv(pose)
+        if self.frame_offset:
+            name = f"{frame_number(name) + self.frame_offset:06d}{Path(name).suffix}"
+        shift = 0.5 - self.pixel_center
+        return Keyframe(name, camera.with_pixel_center(self.pixel_center), pose, pixels + shift, ids)
+
+
+COLMAP = MapConvention()
+EXPORTER = MapConvention(pixel_center=0.0)  # ORB-SLAM3 and its descendants keep OpenCV's pixel coordinates
+
+
+def _zero_or_half(value: float) -> float:
+    if value not in (0.0, 0.5):
+        raise ValueError(f"found {value}; expected 0.0 (OpenCV) or 0.5 (COLMAP)")
+    return value
+
+
+class _Sidecar(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    map_id: int | None = None
+    pose_convention: Literal["w2c", "c2w"] | None = None
+    pixel_center: Annotated[float, AfterValidator(_zero_or_half)] | None = None
+    keypoints: Literal["distorted", "undistorted"] | None = None
+    frame_offset: int | None = None
+    # For whoever writes or views a map; reading one does not need them.
+    image_root: str | None = None
+    image_pattern: str | None = None
+    unit: Literal["arbitrary", "mm"] | None = None
+    fps: float | None = None
+
+
+def declared_convention(folder: Path, map_id: int, habit: MapConvention, roots: tuple[Path, ...] = ()) -> MapConvention:
+    """The habit of the format, overridden by the `densify_map.json` in the map's folder or else in one of the roots."""
+    path = next((p / SIDECAR for p in (folder, *roots) if (p / SIDECAR).is_file()), None)
+    if path is None:
+        return habit
+    try:
+        found = _Sidecar.model_validate(read_json(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{path}: {'.'.join(map(str, first['loc'])) or 'the file'}: {first['msg']}") from error
+    if found.map_id is not None and path.parent == folder and found.map_id != map_id:
+        raise InputError(f"{path}: map_id {found.map_id} in the folder of map {map_id}; correct one of the two")
+    names = ("pixel_center", "pose_convention", "keypoints", "frame_offset")
+    return replace(habit, **{n: getattr(found, n) for n in names if getattr(found, n) is not None})
+
+
+def distorted(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
+    """Where the lens puts what a pinhole camera with the same K sees at pixels (n, 2)."""
+    if not isinstance(camera, Brown | KannalaBrandt):
+        return pixels
+    pinhole = Pinhole(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return camera.project(pinhole.unproject(pixels)[0])[0]
