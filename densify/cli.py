@@ -1,0 +1,342 @@
+"""The verbs of densify: demo, doctor, sparse, densify, evaluate. Thin: arguments in, files out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from densify.alignment import AlignmentConfig
+from densify.doctor import examine
+from densify.fusion import FusionConfig
+from densify.judge import judge_depth, judge_gap, judge_maps, read_run, write_metrics
+from densify.page import Gallery, densify_page
+from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, fitted_to_frames
+from densify.pipeline import densify as densify_maps
+from densify.rectify import RectifyConfig
+from densify.sfm import SfmConfig, sparse_map_from_frames
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.commands import write_synthetic
+from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.errors import InputError
+from lightdepth.maps import read_map
+from lightdepth.progress import Progress
+from lightdepth.report import number
+from lightdepth.run import Run, plain, run_folder
+from lightdepth.sparse_map import SparseMap
+from lightdepth.tube import lens as tube_lens
+from lightdepth.tube import render_sequence
+from lightdepth.tube.slam import SlamConfig, simulate_slam
+
+
+def densify(
+    data: Path,
+    output: Path,
+    map: Path | None = None,
+    checkpoint: str = DEFAULT_CHECKPOINT,
+    format: str | None = None,
+    camera: Path | None = None,
+    light: str | None = None,
+    mask: Path | None = None,
+    withhold: float = 0.2,
+    seed: int = 0,
+    alignment: AlignmentConfig = AlignmentConfig(),
+    rectify: RectifyConfig = RectifyConfig(),
+    fusion: FusionConfig = FusionConfig(),
+    sfm: SfmConfig = SfmConfig(),
+    formats: tuple[str, ...] = ("ply",),
+    mm_per_unit: float | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Dense surfaces from frames and a sparse map, one per submap.
+
+    Args:
+        data: folder of frames
+        output: run folder to make
+        map: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the frames
+        checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
+        format: folder or c3vd; found by looking when left out
+        camera: camera.json; left out, the map's own camera, else the folder's
+        light: light.json, or gamma=2.2,mu=0
+        mask: image, white where tissue shows
+        withhold: share of each keyframe's observed points kept out of the alignment, to judge the surface by
+        seed: draws the withheld points
+        alignment: when a keyframe's scale is found and trusted
+        rectify: which predicted pixels are fused, and how finely
+        fusion: resolution and reach of the surface
+        sfm: how frames are mapped when there is no map
+        formats: of the mesh: ply, glb, obj
+        mm_per_unit: millimetres per map unit, where known; lengths are then written in mm
+        overwrite: replace a run made before
+    """
+    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    unknown = set(formats) - {"ply", "glb", "obj"}
+    if unknown or "ply" not in formats:
+        raise InputError(f"--formats {list(formats)}; expected ply, and besides it glb and obj if wanted")
+    if mm_per_unit is not None and not mm_per_unit > 0:
+        raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
+    config = DensifyConfig(alignment, rectify, fusion, withhold, seed)
+    with run_folder(output, "densify", arguments, overwrite) as run:
+        sparse_map, frames = _map_and_frames(run, data, map, format, camera, light, mask, sfm)
+        for name, path in (("data", data), ("map", map), ("camera", camera), ("mask", mask)):
+            run.hash_input(name, path)
+        work = Densified.make(frames, sparse_map, checkpoint, config)
+        work.write(run, formats, mm_per_unit)
+        notes = [f"{data}, {sparse_map.source}; depth by {work.model}; light of the frames: {_light(frames)}."]
+        page = densify_page("Densified maps", work.results, work.baselines, work.gallery, notes)
+        page.write(run.folder / "report.html")
+        run.log(f"{output}/report.html")
+
+
+def sparse(
+    data: Path,
+    output: Path,
+    format: str | None = None,
+    camera: Path | None = None,
+    mask: Path | None = None,
+    sfm: SfmConfig = SfmConfig(),
+    overwrite: bool = False,
+) -> None:
+    """A sparse map by pycolmap, where there is no SLAM output.
+
+    Args:
+        data: folder of frames
+        output: folder to make, with one COLMAP model per submap
+        format: folder or c3vd; found by looking when left out
+        camera: camera.json that wins over the folder's
+        mask: image, white where tissue shows
+        sfm: how frames are mapped
+        overwrite: replace a folder made before
+    """
+    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    with run_folder(output, "sparse", arguments, overwrite) as run:
+        run.hash_input("data", data)
+        _sparse(run, open_sequence(data, format, camera, None, mask), sfm)
+
+
+def evaluate(
+    run: Path,
+    truth: Path | None = None,
+    output: Path | None = None,
+    join: Path | None = None,
+    format: str | None = None,
+    camera: Path | None = None,
+    mask: Path | None = None,
+    max_depth_mm: float = 100.0,
+) -> None:
+    """Errors of a densify run or of predictions, against truth and between submaps.
+
+    Args:
+        run: folder made by densify or predict
+        truth: sequence with true depth, and for surfaces with true poses
+        output: folder for the metrics; evaluation/ in the run when left out
+        join: JSON with the Sim(3) between two submaps (first, second, scale, rotation, translation): their gap
+        format: of the truth: folder or c3vd; found by looking when left out
+        camera: camera.json that wins over the truth's
+        mask: image, white where tissue shows
+        max_depth_mm: true depth beyond this takes no part
+    """
+    if truth is None and join is None:
+        raise InputError(
+            "nothing to evaluate against: give --truth DATA, or --join FILE for the gap between two submaps"
+        )
+    if not run.is_dir():
+        raise InputError(f"{run}: no such folder")
+    arguments = dict(locals())
+    sequence = open_sequence(truth, format, camera, None, mask) if truth is not None else None
+    predictions = any(run.glob("*.npz"))
+    result: dict[str, Any] = {"kind": "surface"}
+    if predictions and sequence is not None:
+        result = judge_depth(run, sequence, max_depth_mm)
+    else:
+        maps = read_run(run)
+        if sequence is not None:
+            result = judge_maps(maps, sequence)
+        if join is not None:
+            result["gap"] = judge_gap(maps, join)
+    with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite=output is None) as out:
+        out.log(write_metrics({**result, "run": str(run), "truth_folder": str(truth)}, out.folder))
+
+
+def demo(
+    output: Path = Path("runs/demo"),
+    checkpoint: str = DEFAULT_CHECKPOINT,
+    frames: int = 40,
+    seed: int = 7,
+    size: tuple[int, int] = (320, 256),
+    lens: str = "c3vd",
+    spurious: float = 0.3,
+    withhold: float = 0.2,
+    overwrite: bool = False,
+) -> None:
+    """The whole way on a synthetic colon: render, sparse map, densify, evaluate; ends at report.html.
+
+    Args:
+        output: run folder to make
+        checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
+        frames: number of frames to render
+        seed: draws the colon; no bundled checkpoint was trained on seeds below 1000
+        size: width and height of the images, pixels
+        lens: pinhole, fisheye or c3vd
+        spurious: share of wrong map points
+        withhold: share of each keyframe's observed points kept out of the alignment
+        overwrite: replace a run made before
+    """
+    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    with run_folder(output, "demo", arguments, overwrite) as run:
+        with Progress("Rendering", frames) as bar:
+            sequence = render_sequence(
+                seed, frames, tube_lens(lens, *size), 0.7 * frames, progress=lambda *_: bar.advance()
+            )
+        slam = simulate_slam(sequence.frames, SlamConfig(spurious=spurious), seed)
+        write_synthetic(sequence.frames, slam, run.folder / "data")
+        data = open_sequence(run.folder / "data")
+        sparse_map = read_map(run.folder / "data" / "slam")
+        work = Densified.make(data, sparse_map, checkpoint, DensifyConfig(withhold=withhold, seed=seed))
+        work.write(run, ("ply",), None)
+        evaluation = judge_maps(read_run(run.folder), data)
+        run.log(write_metrics(evaluation, run.folder))
+        run.record["evaluation"] = evaluation["maps"]
+        notes = [
+            f"A synthetic colon (seed {seed}), {frames} frames, a simulated SLAM export of {len(sparse_map.submaps)} "
+            f"submaps with {spurious:.0%} wrong points; depth by {work.model}. Truth is exact, so errors are errors.",
+        ]
+        page = densify_page(
+            "Demo: from frames to a dense surface", work.results, work.baselines, work.gallery, notes, evaluation
+        )
+        page.write(run.folder / "report.html")
+        run.log(f"{output}/report.html")
+
+
+def doctor() -> int:
+    """Versions, device and a fused-plane self-test; what is missing and how to get it."""
+    findings = examine()
+    for finding in findings:
+        print(f"{'ok  ' if finding.ok else 'FAIL'}  {finding.what:<24} {finding.detail}")
+    return 0 if all(f.ok for f in findings) else 4
+
+
+@dataclass
+class Densified:
+    """The densify step as verbs use it: results, the same with a constant distance, pictures taken on the way."""
+
+    model: str
+    results: Sequence[SubmapResult]
+    baselines: Sequence[SubmapResult]
+    gallery: Gallery
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def make(cls, frames: FrameSequence, sparse_map: SparseMap, checkpoint: str, config: DensifyConfig) -> Densified:
+        model = load_model(checkpoint, details=False)
+        gallery = Gallery(sparse_map)
+        count = sum(len(s.keyframes) for s in sparse_map.submaps)
+        with Progress("Densifying", count) as bar:
+
+            def show(view: KeyframeView) -> None:
+                gallery(view)
+                bar.advance()
+
+            results = densify_maps(frames, sparse_map, model, config, show)
+        baselines: Sequence[SubmapResult] = []
+        if config.withhold:
+            with Progress("Constant distance, for comparison", count) as bar:
+                baselines = densify_maps(frames, sparse_map, load_model("constant"), config, lambda _: bar.advance())
+        return cls(model.name, results, baselines, gallery)
+
+    def write(self, run: Run, formats: tuple[str, ...], mm_per_unit: float | None) -> None:
+        """Every surface's folder, its figures in run.json and a line for the user. Raises InputError when none was
+        made."""
+        made = [r for r in self.results if len(r.dense.triangles)]
+        if not made:
+            reasons = [f"{a.keyframe}: {a.reason}" for r in self.results for a in r.dense.alignments if not a.ok]
+            raise InputError(f"no keyframe of any map could be aligned; {'; '.join(reasons[:3])}")
+        constant = {b.dense.submap.id: b for b in self.baselines}
+        records = []
+        for result in self.results:
+            dense, withheld = result.dense, result.withheld
+            name = f"map_{dense.submap.id:03d}"
+            baseline = constant.get(dense.submap.id)
+            records.append(
+                {
+                    "map": dense.submap.id,
+                    "keyframes": len(dense.alignments),
+                    "aligned": len(dense.aligned),
+                    "vertices": len(dense.vertices),
+                    "voxel": dense.voxel,
+                    "seen_share": result.seen_share,
+                    "withheld": withheld and asdict(withheld),
+                    "withheld_constant": baseline and baseline.withheld and asdict(baseline.withheld),
+                    "seconds": result.seconds,
+                }
+            )
+            if not len(dense.triangles):
+                run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
+                continue
+            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, mm_per_unit)
+            text = f"{name}: {len(dense.aligned)} of {len(dense.alignments)} keyframes aligned, "
+            text += f"{len(dense.vertices)} vertices"
+            if withheld is not None:
+                text += f"; withheld points {withheld.median:.1%} from the surface"
+                if baseline is not None and baseline.withheld is not None:
+                    text += f" (constant distance {baseline.withheld.median:.1%})"
+            run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
+        run.record.update(
+            {"unit": "mm" if mm_per_unit else "map units", "checkpoint": self.model, "maps": plain(records)}
+        )
+
+
+def _map_and_frames(
+    run: Run,
+    data: Path,
+    map: Path | None,
+    format: str | None,
+    camera: Path | None,
+    light: str | None,
+    mask: Path | None,
+    sfm: SfmConfig,
+) -> tuple[SparseMap, FrameSequence]:
+    if map is None:
+        frames = open_sequence(data, format, camera, light, mask)
+        return _sparse(run, frames, sfm), frames
+    sparse_map = read_map(map)
+    map_camera = sparse_map.submaps[0].keyframes[0].camera
+    frames = open_sequence(data, format, camera, light, mask, map_camera)
+    width, height = frames.image_size()
+    given = frames[0].camera if camera is not None else None
+    if (map_camera.width, map_camera.height) != (width, height):
+        run.log(f"map made at {map_camera.width}x{map_camera.height}, rescaled to the frames' {width}x{height}")
+    return fitted_to_frames(sparse_map, width, height, given), frames
+
+
+def _sparse(run: Run, frames: FrameSequence, config: SfmConfig) -> SparseMap:
+    stages: list[str] = []
+
+    def show(stage: str, done: int, count: int) -> None:
+        if stage not in stages:
+            stages.append(stage)
+            run.log(f"sparse map: {stage}")
+
+    found = sparse_map_from_frames(frames, run.folder / "sparse", config, show)
+    for submap in found.submaps:
+        errors = number(float(_median(submap.reprojection_errors())))
+        run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
+    if found.unregistered:
+        run.log(
+            f"{len(found.unregistered)} of {len(frames)} frames found no place: {', '.join(found.unregistered[:8])}"
+        )
+    run.record["unregistered"] = list(found.unregistered)
+    return found
+
+
+def _median(values: Any) -> float:
+    import numpy as np
+
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _light(frames: FrameSequence) -> str:
+    light = frames[0].light
+    return json.dumps({"gamma": light.gamma, "mu": light.mu, "source": light.source})

@@ -1,0 +1,161 @@
+"""DenseMap: one submap's surface and what it rests on; its files."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from densify.alignment import Alignment
+from lightdepth import native
+from lightdepth.calibration import read_camera, write_camera
+from lightdepth.camera import CameraModel
+from lightdepth.datasets.folder import read_tum, write_tum
+from lightdepth.errors import InputError
+from lightdepth.sparse_map import Submap
+
+GREEN, RED, GREY = (0, 170, 60), (220, 30, 30), (150, 150, 150)
+
+
+class Surface:
+    """A mesh that rays can be cast at: vertices (n, 3), triangles (m, 3)."""
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
+        self._core = native.open3d().core
+        self._scene = native.open3d().t.geometry.RaycastingScene() if len(triangles) else None
+        if self._scene is not None:
+            faces = self._core.Tensor(triangles.astype(np.uint32))
+            self._scene.add_triangles(self._core.Tensor(vertices.astype(np.float32)), faces)
+
+    def cast(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Distance (n,) along unit rays (n, 3) from origins (n, 3) or (3,) to the surface; infinite where there is
+        none."""
+        if self._scene is None or not len(directions):
+            return np.full(len(directions), np.inf)
+        rays = np.concatenate([np.broadcast_to(origins, directions.shape), directions], -1).astype(np.float32)
+        return self._scene.cast_rays(self._core.Tensor(rays))["t_hit"].numpy().astype(np.float64)
+
+
+@dataclass(frozen=True)
+class DenseMap:
+    """vertices (n, 3) and triangles (m, 3) in `unit` ("map units" or "mm"), colors (n, 3) in [0, 1]; the alignments,
+    one for each keyframe of the submap, in order. `voxel` is the size of the fusion's voxels in the same unit."""
+
+    submap: Submap
+    vertices: np.ndarray
+    triangles: np.ndarray
+    colors: np.ndarray
+    alignments: tuple[Alignment, ...]
+    voxel: float
+    unit: str = "map units"
+
+    @property
+    def aligned(self) -> list[Alignment]:
+        return [a for a in self.alignments if a.ok]
+
+    @cached_property
+    def surface(self) -> Surface:
+        return Surface(self.vertices, self.triangles)
+
+    def judged_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) bool each, over the submap's points: judged by any aligned keyframe, and inlier in most of those."""
+        good = np.concatenate([a.inlier_ids for a in self.aligned] or [np.zeros(0, int)])
+        bad = np.concatenate([a.outlier_ids for a in self.aligned] or [np.zeros(0, int)])
+        votes = np.zeros((2, len(self.submap.points)), int)
+        for side, ids in enumerate((good, bad)):
+            np.add.at(votes[side], self.submap.rows_of(ids)[0], 1)
+        return votes.sum(0) > 0, votes[0] > votes[1]
+
+    def write(self, folder: Path, formats: tuple[str, ...] = ("ply",), mm_per_unit: float | None = None) -> None:
+        """mesh.*, cloud.ply, sparse.ply, keyframes.csv, trajectory.tum, camera.json; trajectory times are frame
+        numbers. With mm_per_unit, lengths are written in mm."""
+        import trimesh
+
+        folder.mkdir(parents=True)
+        scale = mm_per_unit or 1.0
+        rgba = np.concatenate([np.rint(self.colors * 255), np.full((len(self.colors), 1), 255)], 1).astype(np.uint8)
+        mesh = trimesh.Trimesh(self.vertices * scale, self.triangles, vertex_colors=rgba, process=False)
+        for suffix in formats:
+            mesh.export(folder / f"mesh.{suffix}")
+        normals = mesh.vertex_normals if len(self.vertices) else np.zeros((0, 3))
+        write_cloud(folder / "cloud.ply", self.vertices * scale, rgba[:, :3], normals)
+        judged, inlier = self.judged_points()
+        color = np.where(inlier[:, None], GREEN, np.where(judged[:, None], RED, GREY))
+        write_cloud(folder / "sparse.ply", self.submap.points * scale, color)
+        self._write_keyframes(folder / "keyframes.csv", scale)
+        poses = []
+        for keyframe in self.submap.keyframes:
+            pose = np.linalg.inv(keyframe.cam_from_map)
+            pose[:3, 3] *= scale
+            poses.append(pose)
+        write_camera(self.submap.keyframes[0].camera, folder / "camera.json")
+        write_tum(folder / "trajectory.tum", [float(k.number) for k in self.submap.keyframes], poses)
+
+    def _write_keyframes(self, path: Path, scale: float) -> None:
+        with path.open("w", newline="") as file:
+            table = csv.writer(file)
+            table.writerow(["keyframe", "frame", "ok", "scale", "sigma", "points", "inliers", "inlier_share", "reason"])
+            for keyframe, a in zip(self.submap.keyframes, self.alignments, strict=True):
+                row = [a.keyframe, keyframe.number, int(a.ok), f"{a.scale * scale:.9g}", f"{a.sigma * scale:.6g}"]
+                table.writerow([*row, a.points, len(a.inlier_ids), f"{a.inlier_share:.4f}", a.reason])
+
+
+def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.ndarray | None = None) -> None:
+    """A binary PLY of points (n, 3) with colors (n, 3) uint8 and, where given, normals (n, 3)."""
+    columns = [(name, "<f4") for name in ("x", "y", "z")]
+    data = [points.astype("<f4")]
+    if normals is not None:
+        columns += [(name, "<f4") for name in ("nx", "ny", "nz")]
+        data.append(normals.astype("<f4"))
+    columns += [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.zeros(len(points), np.dtype(columns))
+    for (name, _), values in zip(
+        columns, np.concatenate([*(d.T for d in data), colors.T.astype(np.float32)]), strict=True
+    ):
+        rows[name] = values
+    types = {"<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property {types[kind]} {name}" for name, kind in columns] + ["end_header", ""]
+    path.write_bytes("\n".join(header).encode() + rows.tobytes())
+
+
+@dataclass(frozen=True)
+class DenseMapFiles:
+    """A dense map read back from its folder: the surface, the sparse points with their colours, the keyframes' frame
+    numbers and poses map_from_cam (n, 4, 4), and the map's camera."""
+
+    id: int
+    vertices: np.ndarray
+    triangles: np.ndarray
+    sparse: np.ndarray
+    sparse_inlier: np.ndarray
+    numbers: np.ndarray
+    map_from_cam: np.ndarray
+    camera: CameraModel
+
+
+def read_dense_map(folder: Path) -> DenseMapFiles:
+    """What DenseMap.write wrote. Raises InputError when it is not all there."""
+    import trimesh
+
+    for name in ("mesh.ply", "sparse.ply", "trajectory.tum", "camera.json"):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder}: {name} missing; expected a map folder of a `lightdepth densify` run")
+    mesh: Any = trimesh.load(folder / "mesh.ply", process=False)
+    cloud: Any = trimesh.load(folder / "sparse.ply", process=False)
+    triangles = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), int)
+    numbers, poses = read_tum(folder / "trajectory.tum")
+    return DenseMapFiles(
+        id=int(folder.name.removeprefix("map_")),
+        vertices=np.asarray(mesh.vertices, float),
+        triangles=triangles,
+        sparse=np.asarray(cloud.vertices, float),
+        sparse_inlier=(np.asarray(cloud.colors)[:, :3] == GREEN).all(1),
+        numbers=numbers.round().astype(int),
+        map_from_cam=poses,
+        camera=read_camera(folder / "camera.json"),
+    )

@@ -1,0 +1,96 @@
+"""What is installed, what is missing and how to get it, and whether the fusion works on this machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass
+
+import numpy as np
+
+from densify.fusion import FusionConfig, TsdfVolume
+from densify.rectify import PinholeView
+from lightdepth import native
+from lightdepth.errors import InputError
+from lightdepth.run import versions
+
+
+@dataclass(frozen=True)
+class Finding:
+    what: str
+    ok: bool
+    detail: str
+
+
+def examine() -> list[Finding]:
+    """All checks, in the order in which they build on each other."""
+    found = versions()
+    needed = ("torch", "lightning", "kornia", "numpy", "scipy", "pycolmap", "opencv-python-headless")
+    findings = [Finding("python", True, f"{found['python']} on {platform.machine()}, {os.cpu_count()} cores")]
+    findings += [Finding(name, name in found, found.get(name, f"missing: pip install {name}")) for name in needed]
+    findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), _torchvision()]
+    return findings
+
+
+def _open3d(found: dict[str, str]) -> Finding:
+    version = found.get("open3d-cpu") or found.get("open3d") or "missing"
+    absent = native.missing_system_libraries()
+    try:
+        native.open3d()
+    except InputError as error:
+        cure = f"; missing: apt-get install {' '.join(absent)}" if absent else ""
+        return Finding("open3d", False, f"{error}{cure}")
+    note = f"; not found by the loader, yet not needed so far: {' '.join(absent)}" if absent else ""
+    return Finding("open3d", True, f"{version}, loads{note}")
+
+
+def _torch_device() -> Finding:
+    import torch
+
+    if torch.cuda.is_available():
+        return Finding("device", True, f"cuda: {torch.cuda.get_device_name(0)}")
+    return Finding(
+        "device", True, f"cpu, {torch.get_num_threads()} threads (a GPU is used where there is one, never needed)"
+    )
+
+
+def _pycolmap() -> Finding:
+    try:
+        names = ("extract_features", "match_sequential", "incremental_mapping", "Reconstruction")
+        missing = [name for name in names if not hasattr(native.pycolmap(), name)]
+    except ImportError as error:
+        return Finding("pycolmap calls", False, f"{error}: pip install 'pycolmap>=4'")
+    return Finding("pycolmap calls", not missing, f"lacks {', '.join(missing)}" if missing else "all there")
+
+
+def _torchvision() -> Finding:
+    from importlib.util import find_spec
+
+    if find_spec("torchvision") is None:
+        return Finding("torchvision", True, "absent, as it should be")
+    try:
+        import torchvision  # noqa: F401
+    except Exception as error:
+        return Finding("torchvision", False, f"broken ({error}), and breaks lightning: pip uninstall torchvision")
+    return Finding("torchvision", True, "there and loads; not needed")
+
+
+def fused_plane_error(voxel: float = 0.5, distance: float = 30.0) -> tuple[int, float]:
+    """Vertices of a fused plane at `distance`, and their largest error along the axis, in voxels."""
+    width, height, focal = 160, 120, 120.0
+    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    depth = np.full((height, width), distance, np.float32)
+    view = PinholeView(depth, np.full((height, width, 3), 0.5, np.float32), matrix, np.eye(4))
+    volume = TsdfVolume(voxel, FusionConfig())
+    volume.integrate(view, np.eye(4))
+    vertices, _, _ = volume.extract_mesh()
+    error = float(np.abs(vertices[:, 2] - distance).max() / voxel) if len(vertices) else np.inf
+    return len(vertices), error
+
+
+def _fused_plane() -> Finding:
+    try:
+        count, error = fused_plane_error()
+    except InputError as error_found:
+        return Finding("fused plane", False, str(error_found))
+    return Finding("fused plane", count > 1000 and error < 0.5, f"{count} vertices, largest error {error:.2g} voxels")

@@ -1,0 +1,177 @@
+"""The report of a densify run: frames with depth, points over images, scales, surfaces, errors, times."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from densify.dense_map import DenseMap
+from densify.pipeline import KeyframeView, SubmapResult
+from lightdepth.figures import (
+    BAD,
+    GOOD,
+    chart,
+    chart_png,
+    colored_distance,
+    marked_points,
+    mesh_picture,
+    png,
+    side_by_side,
+    thumbnail,
+)
+from lightdepth.report import Report, number
+from lightdepth.sparse_map import SparseMap
+
+
+class Gallery:
+    """Pictures of a few keyframes of every submap, taken as they pass."""
+
+    def __init__(self, sparse_map: SparseMap, per_map: int = 3):
+        self._chosen = {
+            (s.id, s.keyframes[i].number)
+            for s in sparse_map.submaps
+            for i in np.linspace(0, len(s.keyframes) - 1, per_map + 2).astype(int)[1:-1]
+        }
+        self.pictures: dict[int, list[tuple[bytes, str]]] = {s.id: [] for s in sparse_map.submaps}
+
+    def __call__(self, view: KeyframeView) -> None:
+        if (view.submap.id, view.keyframe.number) not in self._chosen or view.frame is None or view.prediction is None:
+            return
+        assert view.observed is not None
+        a = view.alignment
+        good, bad = (np.isin(view.observed.point_ids, ids) for ids in (a.inlier_ids, a.outlier_ids))
+        points = marked_points(view.frame.image, [(view.observed.pixels[bad], BAD), (view.observed.pixels[good], GOOD)])
+        depth = thumbnail(colored_distance(view.prediction.distance, view.prediction.valid), 480)
+        picture = side_by_side([thumbnail(view.frame.image, 480), depth, points])
+        state = f"scale {number(a.scale)}, {len(a.inlier_ids)} of {a.points} points inliers" if a.ok else a.reason
+        caption = (
+            f"{view.keyframe.name}: image, predicted distance (yellow near), map points (green in, red out); {state}"
+        )
+        self.pictures[view.submap.id].append((png(picture), caption))
+
+
+def densify_page(
+    title: str,
+    results: Sequence[SubmapResult],
+    baselines: Sequence[SubmapResult],
+    gallery: Gallery,
+    notes: Sequence[str],
+    evaluation: Mapping[str, Any] | None = None,
+) -> Report:
+    """The whole page. `baselines` are the same maps densified with a constant distance, or nothing."""
+    page = Report(title)
+    for note in notes:
+        page.text(note)
+    if evaluation is not None:
+        _errors(page, evaluation)
+    page.heading("Surfaces")
+    rows = []
+    for result in results:
+        d = result.dense
+        aligned = f"{len(d.aligned)} of {len(d.alignments)}"
+        judged, inlier = d.judged_points()
+        points = f"{int(inlier.sum())} in, {int((judged & ~inlier).sum())} out, {int((~judged).sum())} not judged"
+        rows.append([f"map {d.submap.id}", aligned, points, len(d.vertices), d.voxel, result.seen_share])
+    headers = [
+        "",
+        "keyframes aligned",
+        "sparse points",
+        "surface vertices",
+        "voxel [map units]",
+        "pixels that see surface",
+    ]
+    page.table(headers, rows)
+    if any(r.withheld for r in results):
+        _withheld(page, results, baselines)
+    for result in results:
+        _submap(page, result, gallery)
+    _times(page, results)
+    return page
+
+
+def _errors(page: Report, evaluation: Mapping[str, Any]) -> None:
+    page.heading("Errors against the truth")
+    page.text(
+        "Accuracy: distance from each model point to the closest true point, after the Sim(3) that aligns the "
+        "trajectories. mm."
+    )
+    rows = []
+    for entry in evaluation["maps"]:
+        if "error" in entry:
+            page.text(f"Map {entry['map']} could not be evaluated: {entry['error']}")
+            continue
+        for key, name in (
+            ("sparse", "sparse map"),
+            ("sparse_inliers", "sparse, inliers only"),
+            ("dense", "dense surface"),
+        ):
+            found = entry.get(key)
+            if found:
+                where = f"map {entry['map']} (ATE {number(entry['rms_ate_mm'])} mm)"
+                rows.append([where, name, found["points"], found["rms_mm"], found["median_mm"]])
+    page.table(["", "model", "points", "RMS", "median"], rows)
+
+
+def _withheld(page: Report, results: Sequence[SubmapResult], baselines: Sequence[SubmapResult]) -> None:
+    page.heading("Withheld points")
+    page.text(
+        "A share of each keyframe's observed points took no part in the alignment. Their distance from the surface, "
+        "along their rays and relative to their distance from the camera, judges the surface without any truth. "
+        "The same road with a constant distance tells how much of it the predicted depth has earned. "
+        "A ray that misses the surface counts as infinitely far."
+    )
+    rows: list[list[Any]] = []
+    constant = {b.dense.submap.id: b.withheld for b in baselines}
+    for result in results:
+        for name, w in (("this depth", result.withheld), ("constant distance", constant.get(result.dense.submap.id))):
+            if w is not None:
+                rows.append([f"map {result.dense.submap.id}", name, w.points, w.median, w.p90, w.miss])
+    page.table(["", "depth", "points", "median", "90th percentile", "share that misses"], rows)
+
+
+def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:
+    dense = result.dense
+    page.heading(f"Map {dense.submap.id}")
+    left_out = [a for a in dense.alignments if not a.ok]
+    for a in left_out[:5]:
+        page.text(f"Keyframe {a.keyframe} left out: {a.reason}")
+    if len(left_out) > 5:
+        page.text(f"… and {len(left_out) - 5} more (keyframes.csv)")
+    page.figures(mesh_pictures(dense))
+    page.figures([(_scale_chart(dense), "Scale of each keyframe (bars: sigma, as a share of the median distance)")])
+    page.figures(gallery.pictures[dense.submap.id])
+
+
+def mesh_pictures(dense: DenseMap) -> list[tuple[bytes, str]]:
+    """The surface from outside, and from the place of the middle keyframe."""
+    surface = (dense.vertices, dense.triangles, dense.colors)
+    pictures = [(png(mesh_picture(*surface)), f"Surface of map {dense.submap.id} from outside")]
+    keyframes = dense.submap.keyframes
+    middle = keyframes[len(keyframes) // 2]
+    inside = mesh_picture(*surface, origin=middle.center, axes=middle.cam_from_map[:3, :3])
+    return [*pictures, (png(inside), f"… and from keyframe {middle.name}")]
+
+
+def _scale_chart(dense: DenseMap) -> bytes:
+    figure, axes = chart((6.4, 2.6))
+    numbers = np.array([k.number for k in dense.submap.keyframes])
+    ok = np.array([a.ok for a in dense.alignments])
+    scale = np.array([a.scale for a in dense.alignments])
+    spread = np.array([a.sigma / max(a.range_90, 1e-12) for a in dense.alignments]) * scale
+    axes.errorbar(numbers[ok], scale[ok], yerr=spread[ok], fmt="o-", markersize=4, capsize=2, color="#2a6f97")
+    axes.set_xlabel("frame")
+    axes.set_ylabel("map units per predicted unit")
+    axes.set_ylim(bottom=0)
+    return chart_png(figure)
+
+
+def _times(page: Report, results: Sequence[SubmapResult]) -> None:
+    page.heading("Time")
+    count = sum(len(r.dense.alignments) for r in results)
+    steps = list(dict.fromkeys(step for r in results for step in r.seconds))
+    totals = {step: sum(r.seconds.get(step, 0.0) for r in results) for step in steps}
+    page.table(
+        ["step", "seconds", "ms per keyframe"], [[step, t, 1000 * t / max(count, 1)] for step, t in totals.items()]
+    )

@@ -1,0 +1,344 @@
+"""A sparse map from frames alone: structure from motion with COLMAP, for sequences that no SLAM has seen.
+
+Frames become PNG files with masks in a temporary folder; SIFT features are matched, verified and mapped incrementally
+with the calibration held fixed. What does not connect becomes a submap of its own, with its own scale. COLMAP knows no
+Scaramuzza camera: such a lens is replaced by the Kannala-Brandt camera that comes closest, and given back to the
+keyframes.
+
+The only module that uses pycolmap. With one thread and a seed, as is the default, equal frames give equal maps.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from lightdepth.camera import CameraModel, KannalaBrandt, Scaramuzza
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame
+from lightdepth.maps import read_map
+from lightdepth.maps.colmap import holds_model
+from lightdepth.native import pycolmap
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage ("images", "features", "matches", "mapping"), how much of it is done, and of how much."""
+
+_ADVICE = (
+    "What helps: more frames; at least 5 mm of travel with some of it sideways (pure forward motion over 3 mm fails); "
+    "sharp frames (blurred ones have no features); the calibration of this very image size; "
+    "a mask that leaves the tissue free. A lower `peak_threshold` finds more features in smooth tissue"
+)
+
+
+@dataclass(frozen=True)
+class SfmConfig:
+    """How frames are mapped."""
+
+    max_features: int = 4096  # SIFT features per frame, the strongest ones
+    peak_threshold: float = 0.003  # least contrast of a feature, in [0, 1]; COLMAP's 0.0067 misses smooth tissue
+    mask_erosion_px: int = 4  # how far features keep from the border of the mask, pixels
+    highlight: float = 0.98  # a pixel whose three channels all reach this, in [0, 1], is a highlight
+    highlight_margin_px: int = 3  # how far features keep from a highlight, pixels
+    matching: Literal["auto", "sequential", "exhaustive"] = "auto"  # auto: exhaustive for few frames
+    exhaustive_up_to: int = 40  # frames; with `auto`, longer sequences are matched sequentially
+    overlap: int = 10  # frames matched ahead of each, when sequential
+    min_model_size: int = 3  # frames in the smallest submap
+    min_points: int = 8  # points in the smallest submap
+    init_min_tri_angle: float = 4.0  # least angle between the rays of the first pair, degrees
+    init_min_num_inliers: int = 50  # matches that the first pair needs
+    num_threads: int = 1  # more threads change the last bits from run to run, and were not faster on two cores
+    seed: int = 0  # of every RANSAC in it
+
+
+@dataclass(frozen=True)
+class SfmMap(SparseMap):
+    """A sparse map, and the names of the frames that found no place in it."""
+
+    unregistered: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class FisheyeFit:
+    """The Kannala-Brandt camera closest to another, and how close: pixel = camera(rotation @ ray).
+
+    The rotation (3, 3) is about the optical axis, and takes up what the other model's skew hides of it. Residuals in
+    pixels over the field of view.
+    """
+
+    camera: KannalaBrandt
+    rotation: np.ndarray
+    median_px: float
+    max_px: float
+
+
+def sparse_map_from_frames(
+    frames: Sequence[Frame], out_folder: Path, config: SfmConfig | None = None, progress: Progress | None = None
+) -> SfmMap:
+    """Frames -> submaps by number of frames, largest first, also written as COLMAP text models to out_folder/0, 1, ...
+
+    Keyframes are named by their frame's number, six digits, `.png`. Raises InputError, leaving out_folder as it was,
+    when the frames cannot be mapped or the folder already holds a map.
+    """
+    config, progress, out_folder = config or SfmConfig(), progress or _silent, Path(out_folder)
+    _check_free(out_folder)
+    # On the target's disk, so that the finished models arrive by a rename.
+    existing = next(p for p in out_folder.resolve().parents if p.is_dir())
+    with tempfile.TemporaryDirectory(prefix=".sfm-", dir=existing) as work:
+        images, masks, models = (Path(work) / part for part in ("images", "masks", "models"))
+        for folder in (images, masks, models):
+            folder.mkdir()
+        written = _write_images(frames, images, masks, config, progress)
+        fit = fisheye_fit(written.camera, written.valid) if isinstance(written.camera, Scaramuzza) else None
+        count = _reconstruct(Path(work), fit.camera if fit else written.camera, sorted(written.names), config, progress)
+        if not count:
+            raise InputError(
+                f"no sparse map could be made of {len(frames)} frames of {written.camera.width}x"
+                f"{written.camera.height}: COLMAP connected no {config.min_model_size} of them by "
+                f"{config.min_points} points. {_ADVICE}"
+            )
+        submaps = read_map(models).submaps
+        _move_models(models, out_folder)
+    if fit:
+        submaps = tuple(_with_camera(s, written.camera, fit.rotation) for s in submaps)
+    registered = {k.name for s in submaps for k in s.keyframes}
+    unregistered = tuple(frame_name for name, frame_name in sorted(written.names.items()) if name not in registered)
+    if unregistered:
+        log.warning("%d of %d frames are not in the map: %s", len(unregistered), len(frames), ", ".join(unregistered))
+    return SfmMap(submaps, str(out_folder), unregistered)
+
+
+def fisheye_fit(camera: CameraModel, valid: np.ndarray) -> FisheyeFit:
+    """The Kannala-Brandt camera that puts the rays of `camera` closest to their pixels, in least squares.
+
+    valid (H, W): the pixels that count. Only what both models can see is fitted.
+    """
+    from scipy.optimize import least_squares
+
+    rays, seen = camera.rays()
+    rows, columns = np.nonzero(valid & seen)
+    if not len(rows):
+        raise InputError("no valid pixel in the mask: no camera can be fitted to it; is the mask inverted?")
+    step = max(1, len(rows) // 5000)
+    rows, columns = rows[::step], columns[::step]
+    rays, pixels = rays[rows, columns], np.stack([columns, rows], -1) + 0.5
+
+    def candidate(parameters: np.ndarray) -> tuple[KannalaBrandt, np.ndarray]:
+        sine, cosine = np.sin(parameters[8]), np.cos(parameters[8])
+        rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
+        return KannalaBrandt(camera.width, camera.height, *parameters[:8].tolist()), rotation
+
+    def residuals(parameters: np.ndarray) -> np.ndarray:
+        model, rotation = candidate(parameters)
+        turned = rays @ rotation.T
+        # Not `project`: a residual has to exist for every ray, also where a trial's polynomial turns over.
+        side = np.hypot(turned[:, 0], turned[:, 1])
+        theta = np.arctan2(side, turned[:, 2])
+        t2 = theta * theta
+        radius = theta * (1 + t2 * (model.k1 + t2 * (model.k2 + t2 * (model.k3 + t2 * model.k4))))
+        plane = turned[:, :2] * (radius / np.maximum(side, 1e-12))[:, None]
+        return (plane * (model.fx, model.fy) + (model.cx, model.cy) - pixels).ravel()
+
+    focal = camera.focal_length
+    axis = camera.project(np.array([0, 0, 1.0]))[0]
+    start = np.array([focal, focal, *axis, 0, 0, 0, 0, 0])
+    solved = least_squares(residuals, start, x_scale=[focal, focal, focal, focal, 0.1, 0.1, 0.1, 0.1, 0.01])
+    model, rotation = candidate(solved.x)
+    error = np.linalg.norm(solved.fun.reshape(-1, 2), axis=1)
+    fit = FisheyeFit(model, rotation, float(np.median(error)), float(error.max()))
+    level = logging.WARNING if fit.max_px > 2 else logging.INFO
+    log.log(
+        level,
+        "%s camera mapped as OPENCV_FISHEYE: residual median %.2f px, largest %.2f px",
+        camera.name,
+        fit.median_px,
+        fit.max_px,
+    )
+    return fit
+
+
+@dataclass(frozen=True)
+class _Written:
+    """What went to the image folder: the camera, the valid pixels of the first frame, frame names by file name."""
+
+    camera: CameraModel
+    valid: np.ndarray
+    names: dict[str, str]
+
+
+def _write_images(
+    frames: Sequence[Frame], images: Path, masks: Path, config: SfmConfig, progress: Progress
+) -> _Written:
+    """Frames as PNG files, named by number so that they sort in time, each with its COLMAP mask (a.png: a.png.png)."""
+    import cv2
+
+    first: Frame | None = None
+    names: dict[str, str] = {}
+    for done, frame in enumerate(frames, 1):
+        first = first or frame
+        if frame.camera != first.camera:
+            raise InputError(
+                f"{frame.name}: another camera than {first.name}'s; map the frames of one camera at a time"
+            )
+        name = f"{frame.number:06d}.png"
+        if name in names:
+            raise InputError(f"{frame.name} and {names[name]} are both frame {frame.number}; numbers must be unique")
+        names[name] = frame.name
+        image = np.rint(255 * np.clip(frame.image, 0, 1)).astype(np.uint8)
+        for folder, file, pixels in (
+            (images, name, image[..., ::-1]),
+            (masks, f"{name}.png", 255 * usable_pixels(frame, config).astype(np.uint8)),
+        ):
+            if not cv2.imwrite(str(folder / file), pixels):
+                raise InputError(f"{folder / file}: cannot be written; is the disk full?")
+        progress("images", done, len(frames))
+    if first is None or len(names) < config.min_model_size:
+        raise InputError(f"{len(names)} frames; a sparse map needs at least {config.min_model_size}. {_ADVICE}")
+    return _Written(first.camera, first.valid, names)
+
+
+def usable_pixels(frame: Frame, config: SfmConfig) -> np.ndarray:
+    """(H, W) bool: valid, and neither at the border of the mask nor near a highlight, which moves with the light."""
+    import cv2
+
+    def grown(pixels: np.ndarray, margin: int) -> np.ndarray:
+        shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
+        return cv2.dilate(pixels.astype(np.uint8), shape) > 0
+
+    highlight = frame.image.min(-1) >= config.highlight
+    return ~(grown(~frame.valid, config.mask_erosion_px) | grown(highlight, config.highlight_margin_px))
+
+
+def _reconstruct(work: Path, camera: CameraModel, names: list[str], config: SfmConfig, progress: Progress) -> int:
+    """Runs COLMAP on work/images and work/masks; writes its models as text to work/models/<i>, returns how many."""
+    pc, count = pycolmap(), len(names)
+    database = work / "database.db"
+    with _quiet(pc):
+        pc.set_random_seed(config.seed)
+        _extract(pc, work, database, camera, names, config, progress)
+        progress("matches", 0, count)
+        _match(pc, database, count, config)
+        progress("matches", count, count)
+        registered = 0
+
+        def one_more() -> None:
+            nonlocal registered
+            registered = min(registered + 1, count)
+            progress("mapping", registered, count)
+
+        (work / "colmap").mkdir()
+        options = _mapping_options(pc, config)
+        models = pc.incremental_mapping(
+            database, work / "images", work / "colmap", options, next_image_callback=one_more
+        )
+        large = [m for m in models.values() if m.num_reg_images() >= config.min_model_size]
+        large = [m for m in large if m.num_points3D() >= config.min_points]
+        for index, model in enumerate(sorted(large, key=lambda m: -m.num_reg_images())):
+            folder = work / "models" / str(index)
+            folder.mkdir()
+            model.write_text(folder)
+        progress("mapping", count, count)
+    return len(large)
+
+
+def _extract(
+    pc: Any, work: Path, database: Path, camera: CameraModel, names: list[str], config: SfmConfig, progress: Progress
+) -> None:
+    reader = pc.ImageReaderOptions()
+    reader.camera_model, reader.mask_path = camera.name, work / "masks"
+    reader.camera_params = ",".join(repr(p) for p in camera.params)
+    options = pc.FeatureExtractionOptions()
+    options.use_gpu, options.num_threads = False, config.num_threads
+    options.sift.max_num_features, options.sift.peak_threshold = config.max_features, config.peak_threshold
+    piece = 4 if config.num_threads == 1 else 64  # small, for progress and so that an interrupt is heard
+    for start in range(0, len(names), piece):
+        progress("features", start, len(names))
+        pc.extract_features(
+            database,
+            work / "images",
+            image_names=names[start : start + piece],
+            camera_mode=pc.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=options,
+            device=pc.Device.cpu,
+        )
+        reader.existing_camera_id = 1  # the one made by the first piece
+    progress("features", len(names), len(names))
+
+
+def _match(pc: Any, database: Path, count: int, config: SfmConfig) -> None:
+    matching, verification = pc.FeatureMatchingOptions(), pc.TwoViewGeometryOptions()
+    matching.use_gpu, matching.num_threads = False, config.num_threads
+    verification.ransac.random_seed, verification.detect_watermark = config.seed, False
+    options = {"matching_options": matching, "verification_options": verification, "device": pc.Device.cpu}
+    exhaustive = config.matching == "exhaustive" or (config.matching == "auto" and count <= config.exhaustive_up_to)
+    if exhaustive:
+        pc.match_exhaustive(database, **options)
+    else:
+        pairing = pc.SequentialPairingOptions()
+        pairing.overlap, pairing.quadratic_overlap = config.overlap, False
+        pc.match_sequential(database, pairing_options=pairing, **options)
+
+
+def _mapping_options(pc: Any, config: SfmConfig) -> Any:
+    options = pc.IncrementalPipelineOptions()
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = config.seed
+    options.num_threads = options.mapper.num_threads = config.num_threads
+    options.multiple_models, options.min_model_size = True, config.min_model_size
+    # The calibration is given: refining it on a short endoscopic sequence would trade it against the shape.
+    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.init_min_tri_angle = config.init_min_tri_angle
+    options.mapper.init_min_num_inliers = config.init_min_num_inliers
+    options.mapper.init_max_forward_motion = 1.0  # an endoscope moves forward: COLMAP would refuse such first pairs
+    return options
+
+
+@contextmanager
+def _quiet(pc: Any) -> Iterator[None]:
+    """COLMAP's log kept to what ends the process: a failure is reported by us, in one message."""
+    before = pc.logging.minloglevel
+    pc.logging.minloglevel = 3
+    try:
+        yield
+    finally:
+        pc.logging.minloglevel = before
+
+
+def _with_camera(submap: Submap, camera: CameraModel, rotation: np.ndarray) -> Submap:
+    """The submap seen by the camera that was replaced: pixel = mapped(rotation @ ray) = camera(ray)."""
+    back = np.eye(4)
+    back[:3, :3] = rotation.T
+
+    def restored(keyframe: Keyframe) -> Keyframe:
+        return replace(keyframe, camera=camera, cam_from_map=back @ keyframe.cam_from_map)
+
+    return replace(submap, keyframes=tuple(restored(k) for k in submap.keyframes))
+
+
+def _check_free(out_folder: Path) -> None:
+    if out_folder.exists() and not out_folder.is_dir():
+        raise InputError(f"{out_folder}: a file; expected a folder to write the map to")
+    taken = [p for p in out_folder.glob("*") if p.name.isdigit()] if out_folder.is_dir() else []
+    if taken or (out_folder.is_dir() and holds_model(out_folder)):
+        raise InputError(f"{out_folder}: holds a map already; remove it, or use it as the map (--map {out_folder})")
+
+
+def _move_models(models: Path, out_folder: Path) -> None:
+    out_folder.mkdir(parents=True, exist_ok=True)
+    for folder in sorted(models.iterdir()):
+        shutil.move(folder, out_folder / folder.name)
+
+
+def _silent(stage: str, done: int, count: int) -> None:
+    pass
