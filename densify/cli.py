@@ -22,6 +22,7 @@ from lightdepth.commands import write_synthetic
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
 from lightdepth.maps import read_map
+from lightdepth.predict import DepthModel
 from lightdepth.progress import Progress
 from lightdepth.report import number
 from lightdepth.run import Run, plain, run_folder
@@ -78,11 +79,12 @@ def densify(
     if mm_per_unit is not None and not mm_per_unit > 0:
         raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
     config = DensifyConfig(alignment, rectify, fusion, withhold, seed)
+    model = load_model(checkpoint, details=False)  # before minutes are spent on a sparse map
     with run_folder(output, "densify", arguments, overwrite) as run:
         sparse_map, frames = _map_and_frames(run, data, map, format, camera, light, mask, sfm)
         for name, path in (("data", data), ("map", map), ("camera", camera), ("mask", mask)):
             run.hash_input(name, path)
-        work = Densified.make(frames, sparse_map, checkpoint, config)
+        work = Densified.make(frames, sparse_map, model, config)
         work.write(run, formats, mm_per_unit)
         notes = [f"{data}, {sparse_map.source}; depth by {work.model}; light of the frames: {_light(frames)}."]
         page = densify_page("Densified maps", work.results, work.baselines, work.gallery, notes)
@@ -185,6 +187,7 @@ def demo(
         overwrite: replace a run made before
     """
     arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    model = load_model(checkpoint, details=False)
     with run_folder(output, "demo", arguments, overwrite) as run:
         with Progress("Rendering", frames) as bar:
             sequence = render_sequence(
@@ -194,7 +197,7 @@ def demo(
         write_synthetic(sequence.frames, slam, run.folder / "data")
         data = open_sequence(run.folder / "data")
         sparse_map = read_map(run.folder / "data" / "slam")
-        work = Densified.make(data, sparse_map, checkpoint, DensifyConfig(withhold=withhold, seed=seed))
+        work = Densified.make(data, sparse_map, model, DensifyConfig(withhold=withhold, seed=seed))
         work.write(run, ("ply",), None)
         evaluation = judge_maps(read_run(run.folder), data)
         run.log(write_metrics(evaluation, run.folder))
@@ -229,8 +232,7 @@ class Densified:
     extra: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def make(cls, frames: FrameSequence, sparse_map: SparseMap, checkpoint: str, config: DensifyConfig) -> Densified:
-        model = load_model(checkpoint, details=False)
+    def make(cls, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel, config: DensifyConfig) -> Densified:
         gallery = Gallery(sparse_map)
         count = sum(len(s.keyframes) for s in sparse_map.submaps)
         with Progress("Densifying", count) as bar:
@@ -272,6 +274,8 @@ class Densified:
                     "seconds": result.seconds,
                 }
             )
+            for keyframe, reason in result.unread.items():
+                run.fail(f"{name}, keyframe {keyframe}", reason)
             if not len(dense.triangles):
                 run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
                 continue
@@ -279,9 +283,9 @@ class Densified:
             text = f"{name}: {len(dense.aligned)} of {len(dense.alignments)} keyframes aligned, "
             text += f"{len(dense.vertices)} vertices"
             if withheld is not None:
-                text += f"; withheld points {withheld.median:.1%} from the surface"
+                text += f"; withheld points {_share(withheld.median)} from the surface"
                 if baseline is not None and baseline.withheld is not None:
-                    text += f" (constant distance {baseline.withheld.median:.1%})"
+                    text += f" (constant distance {_share(baseline.withheld.median)})"
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
         run.record.update(
             {"unit": "mm" if mm_per_unit else "map units", "checkpoint": self.model, "maps": plain(records)}
@@ -335,6 +339,10 @@ def _median(values: Any) -> float:
     import numpy as np
 
     return float(np.median(values)) if len(values) else float("nan")
+
+
+def _share(value: float) -> str:
+    return f"{value:.1%}" if value < float("inf") else "infinitely far"
 
 
 def _light(frames: FrameSequence) -> str:

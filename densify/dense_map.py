@@ -78,7 +78,8 @@ class DenseMap:
         folder.mkdir(parents=True)
         scale = mm_per_unit or 1.0
         rgba = np.concatenate([np.rint(self.colors * 255), np.full((len(self.colors), 1), 255)], 1).astype(np.uint8)
-        mesh = trimesh.Trimesh(self.vertices * scale, self.triangles, vertex_colors=rgba, process=False)
+        colors = rgba if len(rgba) else None  # trimesh cannot write the colours of no vertices
+        mesh = trimesh.Trimesh(self.vertices * scale, self.triangles, vertex_colors=colors, process=False)
         for suffix in formats:
             mesh.export(folder / f"mesh.{suffix}")
         normals = mesh.vertex_normals if len(self.vertices) else np.zeros((0, 3))
@@ -140,18 +141,18 @@ class DenseMapFiles:
 
 def read_dense_map(folder: Path) -> DenseMapFiles:
     """What DenseMap.write wrote. Raises InputError when it is not all there."""
-    import trimesh
-
     for name in ("mesh.ply", "sparse.ply", "trajectory.tum", "camera.json"):
         if not (folder / name).is_file():
             raise InputError(f"{folder}: {name} missing; expected a map folder of a `lightdepth densify` run")
-    mesh: Any = trimesh.load(folder / "mesh.ply", process=False)
-    cloud: Any = trimesh.load(folder / "sparse.ply", process=False)
+    map_id = folder.name.removeprefix("map_")
+    if not (map_id.isascii() and map_id.isdigit()):
+        raise InputError(f"{folder}: expected a name such as map_000, with the number of the map")
+    mesh, cloud = _read_ply(folder / "mesh.ply"), _read_ply(folder / "sparse.ply")
     triangles = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), int)
     numbers, poses = read_tum(folder / "trajectory.tum")
     return DenseMapFiles(
-        id=int(folder.name.removeprefix("map_")),
-        vertices=np.asarray(mesh.vertices, float),
+        id=int(map_id),
+        vertices=np.asarray(getattr(mesh, "vertices", np.zeros((0, 3))), float),  # an empty mesh is read as a scene
         triangles=triangles,
         sparse=np.asarray(cloud.vertices, float),
         sparse_inlier=(np.asarray(cloud.colors)[:, :3] == GREEN).all(1),
@@ -159,3 +160,12 @@ def read_dense_map(folder: Path) -> DenseMapFiles:
         map_from_cam=poses,
         camera=read_camera(folder / "camera.json"),
     )
+
+
+def _read_ply(path: Path) -> Any:
+    import trimesh
+
+    try:
+        return trimesh.load(path, process=False)
+    except (ValueError, KeyError, IndexError, OSError) as error:
+        raise InputError(f"{path}: damaged, or not a PLY file ({error})") from error

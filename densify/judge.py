@@ -23,6 +23,7 @@ from lightdepth.errors import InputError
 from lightdepth.prediction import read_prediction
 from lightdepth.report import number
 from lightdepth.run import plain
+from lightdepth.sparse_map import check_rigid
 
 _NO_DEPTH = ("no true depth", "the true depth is invalid everywhere")
 
@@ -111,6 +112,9 @@ def judge_gap(maps: Sequence[DenseMapFiles], join: Path) -> dict[str, Any]:
         first, second = int(data["first"]), int(data["second"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{join}: expected first, second, scale, rotation, translation ({error!r})") from error
+    if not (np.isfinite(sim.scale) and sim.scale > 0):
+        raise InputError(f"{join}: scale {sim.scale}; expected a positive number")
+    check_rigid(np.vstack([np.column_stack([sim.rotation, sim.translation]), [0, 0, 0, 1]]), f"{join}: rotation")
     by_id = {m.id: m for m in maps}
     missing = [i for i in (first, second) if i not in by_id]
     if missing:

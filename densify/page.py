@@ -42,9 +42,15 @@ class Gallery:
         assert view.observed is not None
         a = view.alignment
         good, bad = (np.isin(view.observed.point_ids, ids) for ids in (a.inlier_ids, a.outlier_ids))
-        points = marked_points(view.frame.image, [(view.observed.pixels[bad], BAD), (view.observed.pixels[good], GOOD)])
-        depth = thumbnail(colored_distance(view.prediction.distance, view.prediction.valid), 480)
-        picture = side_by_side([thumbnail(view.frame.image, 480), depth, points])
+        if not view.frame.valid.any():
+            return
+        rows, columns = (np.flatnonzero(view.frame.valid.any(axis)) for axis in (1, 0))
+        part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        image, corner = view.frame.image[part], np.array([columns[0], rows[0]])
+        depth = thumbnail(colored_distance(view.prediction.distance[part], view.prediction.valid[part]), 480)
+        pixels = view.observed.pixels - corner
+        points = marked_points(image, [(pixels[bad], BAD), (pixels[good], GOOD)])
+        picture = side_by_side([thumbnail(image, 480), depth, points])
         state = f"scale {number(a.scale)}, {len(a.inlier_ids)} of {a.points} points inliers" if a.ok else a.reason
         caption = (
             f"{view.keyframe.name}: image, predicted distance (yellow near), map points (green in, red out); {state}"
@@ -140,8 +146,10 @@ def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:
     if len(left_out) > 5:
         page.text(f"… and {len(left_out) - 5} more (keyframes.csv)")
     page.figures(mesh_pictures(dense))
-    page.figures([(_scale_chart(dense), "Scale of each keyframe (bars: sigma, as a share of the median distance)")])
-    page.figures(gallery.pictures[dense.submap.id])
+    page.wide_figures(
+        [(_scale_chart(dense), "Scale of each keyframe (bars: sigma, as a share of the median distance)")]
+    )
+    page.wide_figures(gallery.pictures[dense.submap.id])
 
 
 def mesh_pictures(dense: DenseMap) -> list[tuple[bytes, str]]:

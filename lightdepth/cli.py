@@ -57,9 +57,9 @@ def main(argv: list[str] | None = None) -> int:
 def _parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     import jsonargparse
 
-    parser = jsonargparse.ArgumentParser(
-        prog=f"lightdepth {verb}", description=inspect.getdoc(function), default_env=False
-    )
+    # The first line only: jsonargparse shows the rest of the docstring beside the options.
+    summary = (inspect.getdoc(function) or "").split("\n")[0]
+    parser = jsonargparse.ArgumentParser(prog=f"lightdepth {verb}", description=summary, default_env=False)
     parser.add_argument("--config", action="config", help="a YAML file with any of these options")
     parameters = inspect.signature(function).parameters
     # Declared here, because options derived from parameters have no short form and no bare flags.

@@ -42,6 +42,10 @@ class Report:
         """PNG pictures with captions, beside each other where there is room."""
         self._parts.append('<div class="figures">' + "".join(_figure(*p) for p in pictures) + "</div>")
 
+    def wide_figures(self, pictures: Sequence[tuple[bytes, str]]) -> None:
+        """PNG pictures with captions, one below the other."""
+        self._parts += [_figure(*p) for p in pictures]
+
     def write(self, path: Path) -> None:
         head = f'<meta charset="utf-8"><title>{html.escape(self._title)}</title><style>{_STYLE}</style>'
         path.write_text(f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(self._parts)}</body></html>\n")
@@ -65,4 +69,6 @@ def number(value: Any) -> str:
         return "–"
     if isinstance(value, int):
         return str(value)
+    if value == float("inf"):
+        return "∞"
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

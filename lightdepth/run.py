@@ -1,19 +1,21 @@
 """Run folders: what a verb writes appears whole or not at all, and says how it was made.
 
-Work goes to `OUT.partial` beside OUT and is renamed when it is complete; run.json is written last. A verb that fails
-leaves OUT as it was.
+Work goes to a hidden folder beside OUT, which is renamed when it is complete; run.json is written last. A verb that
+fails leaves OUT as it was.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import platform
 import resource
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -79,10 +81,11 @@ def run_folder(output: Path, verb: str, arguments: Mapping[str, Any], overwrite:
             raise InputError(f"{output}: already there and not empty; choose another -o, or give --overwrite")
         if not (output / "run.json").is_file():
             raise InputError(f"{output}: not overwritten, it has no run.json and so was not made by this program")
-    staging = output.with_name(output.name + ".partial")
-    shutil.rmtree(staging, ignore_errors=True)
     try:
-        staging.mkdir(parents=True)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        # Beside the target, so that the finished folder arrives by a rename; a name of its own: nothing is in its way.
+        staging = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
+        staging.chmod(0o755)
     except OSError as error:
         raise InputError(f"{output}: cannot be made ({error.strerror})") from error
     run = Run(staging, verb, arguments)
@@ -172,6 +175,6 @@ def plain(value: Any) -> Any:
         return str(value)
     if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:
         value = value.item()
-    if (isinstance(value, float) and value not in (value,)) or value in (float("inf"), float("-inf")):
-        return None
+    if isinstance(value, float) and not math.isfinite(value):
+        return None  # JSON has neither NaN nor infinity
     return value

@@ -111,6 +111,9 @@ def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(f"{path}: {rows.shape[1]} columns; a TUM trajectory has 8: t tx ty tz qx qy qz qw")
     if not np.isfinite(rows).all():
         raise InputError(f"{path}: line {int((~np.isfinite(rows)).any(1).argmax()) + 1} has NaN or infinite numbers")
+    length = np.linalg.norm(rows[:, 4:], axis=1)
+    if (length < 1e-6).any():
+        raise InputError(f"{path}: line {int((length < 1e-6).argmax()) + 1}: the quaternion qx qy qz qw is zero")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]

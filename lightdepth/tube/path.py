@@ -28,7 +28,7 @@ C3VD = Scaramuzza(
 
 
 def lens(kind: str, width: int, height: int) -> CameraModel:
-    """A typical lens: "pinhole" (90 degrees across), "fisheye" (140 degrees across) or "c3vd"."""
+    """A typical lens: "pinhole" (90 degrees across), "fisheye" (136 degrees across) or "c3vd"."""
     centre = (width / 2, height / 2)
     if kind == "pinhole":
         return Pinhole(width, height, width / 2, width / 2, *centre)

@@ -1,0 +1,137 @@
+"""The verbs of lightdepth: synth and predict. Thin: arguments in, files out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from lightdepth.calibration import read_light
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.datasets import open_sequence, write_c3vd, write_folder
+from lightdepth.errors import InputError
+from lightdepth.figures import colored_distance, png, side_by_side, thumbnail
+from lightdepth.frame import Frame
+from lightdepth.maps import write_multimap
+from lightdepth.progress import Progress
+from lightdepth.run import plain, run_folder
+from lightdepth.tube import lens as tube_lens
+from lightdepth.tube import render_sequence
+from lightdepth.tube.scene import TubeConfig
+from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
+
+
+def synth(
+    output: Path,
+    layout: Literal["frames", "c3vd"] = "frames",
+    lens: str = "c3vd",
+    frames: int = 40,
+    size: tuple[int, int] = (320, 256),
+    seed: int = 0,
+    travel_mm: float = 30.0,
+    spurious: float | None = None,
+    light: str | None = None,
+    scene: TubeConfig = TubeConfig(),
+    slam: SlamConfig = SlamConfig(),
+    overwrite: bool = False,
+) -> None:
+    """A synthetic colon sequence with exact truth, and a multi-map SLAM export with known wrong points.
+
+    Args:
+        output: folder to make
+        layout: frames (our own folder) or c3vd
+        lens: pinhole, fisheye or c3vd
+        frames: number of frames
+        size: width and height of the images, pixels
+        seed: draws the colon, its light and the path
+        travel_mm: length of the path
+        spurious: share of wrong map points; left out, slam.spurious
+        light: light.json or gamma=2.2,mu=0 to have instead of a drawn one
+        scene: ranges of shape, texture and sensor
+        slam: quality of the simulated SLAM
+        overwrite: replace a folder made before
+    """
+    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    if frames < 1:
+        raise InputError(f"--frames {frames}; expected at least 1")
+    slam = slam if spurious is None else replace(slam, spurious=spurious)
+    if not 0 <= slam.spurious < 1:
+        raise InputError(f"--spurious {slam.spurious}; expected a share of at least 0 and below 1")
+    chosen = read_light(light) if light is not None else None
+    with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", frames) as bar:
+        sequence = render_sequence(
+            seed, frames, tube_lens(lens, *size), travel_mm, scene, chosen, lambda *_: bar.advance()
+        )
+        export = simulate_slam(sequence.frames, slam, seed)
+        write_synthetic(sequence.frames, export, run.folder, layout)
+        run.log(f"{frames} frames, {len(export.map.submaps)} submaps in {output}")
+
+
+def write_synthetic(frames: Sequence[Frame], export: SimulatedSlam, folder: Path, layout: str = "frames") -> None:
+    """The sequence (with truth) at `folder`, the SLAM export in slam/, what only the simulation knows in
+    truth/slam.json."""
+    if layout == "c3vd":
+        write_c3vd(frames, folder / "sequence")
+    else:
+        write_folder(frames, folder)
+    write_multimap(export.map, folder / "slam")
+    known = {
+        str(i): {
+            "map_from_world": {"scale": s, "rotation": r.tolist(), "translation": t.tolist()},
+            "spurious_point_ids": export.spurious_ids[i].tolist(),
+        }
+        for i, (s, r, t) in export.map_from_world.items()
+    }
+    (folder / "truth").mkdir(exist_ok=True)
+    (folder / "truth" / "slam.json").write_text(json.dumps(plain(known)) + "\n")
+
+
+def predict(
+    data: Path,
+    output: Path,
+    checkpoint: str = DEFAULT_CHECKPOINT,
+    format: str | None = None,
+    camera: Path | None = None,
+    light: str | None = None,
+    mask: Path | None = None,
+    previews: bool = True,
+    overwrite: bool = False,
+) -> None:
+    """Distance, albedo and normals of every frame of a sequence, as one .npz a frame.
+
+    Args:
+        data: folder of frames
+        output: folder to make
+        checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
+        format: folder or c3vd; found by looking when left out
+        camera: camera.json that wins over the folder's
+        light: light.json, or gamma=2.2,mu=0, that wins over the folder's
+        mask: image, white where tissue shows
+        previews: also write a PNG with image and distance for every frame
+        overwrite: replace a folder made before
+    """
+    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    model = load_model(checkpoint)
+    frames = open_sequence(data, format, camera, light, mask)
+    with run_folder(output, "predict", arguments, overwrite) as run, Progress("Predicting", len(frames)) as bar:
+        run.hash_input("data", data)
+        if previews:
+            (run.folder / "previews").mkdir()
+        for i in range(len(frames)):
+            try:
+                frame = frames[i]
+            except InputError as error:
+                run.fail(frames.names[i], str(error))
+                continue
+            prediction = model(frame)
+            prediction.save(run.folder / f"{frame.name}.npz")
+            if previews:
+                colors = colored_distance(prediction.distance, prediction.valid)
+                picture = side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)])
+                (run.folder / "previews" / f"{frame.name}.png").write_bytes(png(picture))
+            bar.advance()
+        if len(run.record["failures"]) == len(frames):
+            raise InputError(f"{data}: no frame could be read; the first: {run.record['failures'][0]['reason']}")
+        run.record["checkpoint"] = model.name

@@ -1,0 +1,66 @@
+"""What goes into a depth network and what comes out, whatever lies between.
+
+Notation: t distance along the unit ray r, V = max(R, G, B), c = log t in closed form (lightdepth.decline). Images are
+(B, C, H, W).
+
+In: channels chosen by name, each zero outside the mask. Out, from three raw channels (a, h, s):
+
+    log t = mean c + a - mean a    output "absolute"
+    log t = c + a - mean a         output "residual": a correction of the closed form; a = 0 is the baseline
+    albedo = (sigmoid h, sigmoid s), hue and saturation of a colour whose value is 1
+
+The scale is always the closed form's: no loss that is free of gain could teach it, and left free it drifts until
+exp overflows.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lightdepth.decline import log_closed_form
+from lightdepth.photometry import LightTerms
+
+CHANNELS = {"rgb": 3, "closed_form": 1, "ray_z": 1, "mask": 1}
+"""Inputs to choose from, and how many channels each takes."""
+
+OUTPUTS = ("residual", "absolute")
+
+_LOG_LIMIT = 15.0  # only to keep exp, and its square, finite
+
+
+def input_channels(names: tuple[str, ...]) -> int:
+    return sum(CHANNELS[name] for name in names)
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of (B, 1, H, W) inside the mask, (B, 1, 1, 1); 0 where the mask is empty."""
+    total = torch.where(mask, values, 0).sum((-2, -1), keepdim=True)
+    return total / mask.sum((-2, -1), keepdim=True).clamp(min=1)
+
+
+def network_inputs(
+    image: Tensor, mask: Tensor, rays: Tensor, light: LightTerms, names: tuple[str, ...], blur: float
+) -> tuple[Tensor, Tensor]:
+    """The input channels (B, C, H, W) and the log closed form c (B, 1, H, W), which outside the mask is its mean.
+
+    `blur` of the closed form as a share of the image height.
+    """
+    log_closed = log_closed_form(image, mask, rays, light, blur)
+    mean = masked_mean(log_closed, mask)
+    log_closed = torch.where(mask, log_closed, mean)
+    made = {
+        "rgb": torch.where(mask, image - 0.5, 0),
+        "closed_form": log_closed - mean,
+        "ray_z": torch.where(mask, rays[:, 2:3], 0),
+        "mask": mask.to(image.dtype),
+    }
+    return torch.cat([made[name] for name in names], 1), log_closed
+
+
+def network_outputs(raw: Tensor, log_closed: Tensor, mask: Tensor, output: str) -> tuple[Tensor, Tensor]:
+    """Distance (B, 1, H, W) > 0 and albedo as hue and saturation (B, 2, H, W), from raw channels (B, 3, H, W)."""
+    shape = raw[:, :1].float()
+    base = log_closed if output == "residual" else masked_mean(log_closed, mask)
+    log_distance = base + shape - masked_mean(shape, mask)
+    return log_distance.clamp(-_LOG_LIMIT, _LOG_LIMIT).exp(), raw[:, 1:].float().sigmoid()

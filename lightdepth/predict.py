@@ -1,0 +1,153 @@
+"""Models that turn a frame into a DepthPrediction, all behind the same two things: `model.name` and `model(frame)`.
+
+A model works at its own image size (a network at the rows it was trained on) and gives the prediction at the frame's:
+log distance is interpolated, so that halfway between t and 4t lies 2t.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Protocol
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lightdepth.camera import CameraModel
+from lightdepth.decline import BLUR, V_FLOOR, log_closed_form
+from lightdepth.frame import Frame, FrameBatch, to_batch
+from lightdepth.geometry import normals_from_distance
+from lightdepth.network import DepthNetwork
+from lightdepth.photometry import brightness, decode, hue_saturation_albedo
+from lightdepth.prediction import DepthPrediction
+
+
+class DepthModel(Protocol):
+    """What every model is: a name for provenance, and a call."""
+
+    @property
+    def name(self) -> str: ...
+
+    def __call__(self, frame: Frame) -> DepthPrediction: ...
+
+
+def working_size(camera: CameraModel, rows: int) -> tuple[int, int]:
+    """(width, height) of an image with so many rows and the camera's aspect."""
+    return max(1, round(camera.width * rows / camera.height)), rows
+
+
+class DeclineModel:
+    """The closed form of lightdepth.decline, computed at no more than `rows` rows.
+
+    With `details` it also gives the albedo of value 1 that the colours say, and the normals of the distance.
+    """
+
+    name = "decline"
+
+    def __init__(self, rows: int = 512, blur: float = BLUR, details: bool = True) -> None:
+        self.rows, self.blur, self.details = rows, blur, details
+
+    @torch.inference_mode()
+    def __call__(self, frame: Frame) -> DepthPrediction:
+        batch = to_batch(frame, working_size(frame.camera, min(self.rows, frame.camera.height)))
+        log_distance = log_closed_form(batch.image, batch.mask, batch.rays, batch.light, self.blur)
+        albedo = None
+        if self.details:
+            colour = batch.image / brightness(batch.image).clamp(min=V_FLOOR)
+            albedo = decode(colour.clamp(max=1), batch.light.gamma)
+        return _prediction(frame, batch, log_distance, albedo, self.name, self.details)
+
+
+class ConstantModel:
+    """Distance 1 everywhere: what a model that knows nothing says. The baseline of every evaluation."""
+
+    name = "constant"
+
+    def __call__(self, frame: Frame) -> DepthPrediction:
+        ones = np.ones((frame.camera.height, frame.camera.width), np.float32)
+        return DepthPrediction(frame.name, ones, _valid(frame), frame.camera, self.name)
+
+
+class NetworkModel:
+    """A trained network, run at images of `rows` rows. `card` says what it was trained on."""
+
+    def __init__(
+        self, network: DepthNetwork, rows: int, name: str, card: dict | None = None, details: bool = True
+    ) -> None:
+        self.network = network.eval()
+        self.rows, self.name, self.card, self.details = rows, name, card or {}, details
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.network.parameters()).device
+
+    def to(self, device: torch.device | str) -> NetworkModel:
+        """The same model, its weights moved to a device."""
+        self.network.to(device)
+        return self
+
+    @torch.inference_mode()
+    def __call__(self, frame: Frame) -> DepthPrediction:
+        batch = to_batch(frame, working_size(frame.camera, self.rows)).to(self.device)
+        distance, albedo_hs = self.network(batch.image, batch.mask, batch.rays, batch.light)
+        albedo = hue_saturation_albedo(albedo_hs) if self.details else None
+        return _prediction(frame, batch, distance.log(), albedo, self.name, self.details)
+
+
+def predict(
+    model: DepthModel, frames: Iterable[Frame], progress: Callable[[int], None] | None = None
+) -> Iterator[DepthPrediction]:
+    """Predictions of frames, one by one; `progress` is told how many are done."""
+    for count, frame in enumerate(frames, 1):
+        yield model(frame)
+        if progress is not None:
+            progress(count)
+
+
+def _prediction(
+    frame: Frame, batch: FrameBatch, log_distance: Tensor, albedo: Tensor | None, source: str, details: bool
+) -> DepthPrediction:
+    """Brings what was computed on a batch of one at the working size to the frame's."""
+    size = (frame.camera.width, frame.camera.height)
+    log_distance = _extended(log_distance.float(), batch.mask)
+    normals = _upsampled(normals_from_distance(log_distance.exp(), batch.rays), size) if details else None
+    if normals is not None:
+        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
+    return DepthPrediction(
+        name=frame.name,
+        distance=np.exp(_upsampled(log_distance, size)),
+        valid=_valid(frame),
+        camera=frame.camera,
+        source=source,
+        albedo=None if albedo is None else _upsampled(_extended(albedo, batch.mask), size),
+        normals=normals,
+    )
+
+
+def _valid(frame: Frame) -> np.ndarray:
+    """(H, W) bool: inside mask and lens, and not black."""
+    # A chain of comparisons is ten times as fast as the maximum over the last axis.
+    red, green, blue = (frame.image[..., channel] for channel in range(3))
+    return frame.valid & (np.maximum(np.maximum(red, green), blue) > V_FLOOR)
+
+
+def _extended(values: Tensor, mask: Tensor, steps: int = 2) -> Tensor:
+    """Values (1, C, H, W) continued outside the mask from their neighbours inside, a pixel a step.
+
+    A coarse pixel that merges masked ones is invalid as a whole; the rim of the full-size mask interpolates into it.
+    """
+    for _ in range(steps):
+        weight = F.avg_pool2d(mask.float(), 3, 1, 1)
+        around = F.avg_pool2d(torch.where(mask, values, 0), 3, 1, 1) / weight.clamp(min=1e-6)
+        reached = weight > 1e-6
+        values = torch.where(mask, values, torch.where(reached, around, values))
+        mask = mask | reached
+    return values
+
+
+def _upsampled(values: Tensor, size: tuple[int, int]) -> np.ndarray:
+    """(1, C, h, w) -> (H, W, C), or (H, W) of one channel, bilinear; size is (width, height)."""
+    array = np.ascontiguousarray(values[0].float().cpu().numpy().transpose(1, 2, 0))
+    return cv2.resize(array, size, interpolation=cv2.INTER_LINEAR) if array.shape[1::-1] != size else array.squeeze()

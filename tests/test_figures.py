@@ -1,0 +1,100 @@
+"""Pictures are what they say, and need no display."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from lightdepth.figures import (
+    BAD,
+    GOOD,
+    chart,
+    chart_png,
+    colored_distance,
+    marked_points,
+    mesh_picture,
+    png,
+    side_by_side,
+    thumbnail,
+)
+
+
+def decoded(data: bytes) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def test_a_png_is_the_image_in_rgb():
+    image = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
+    np.testing.assert_array_equal(decoded(png(image)), image)
+    np.testing.assert_array_equal(decoded(png(image / 255.0)), image)
+    assert (decoded(png(np.full((2, 2, 3), 1.7))) == 255).all()  # clipped, not wrapped
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_a_thumbnail_keeps_aspect_and_brightness(dtype):
+    image = np.full((60, 90, 3), 0.4 if dtype == np.float32 else 102, dtype)
+    small = thumbnail(image, 30)
+    assert small.shape == (20, 30, 3) and small.dtype == np.uint8 and (small == 102).all()
+    assert thumbnail(image[:1], 10).shape == (1, 10, 3)
+
+
+def test_near_is_bright_far_is_dark_and_unknown_is_black():
+    distance = np.tile(np.linspace(5, 50, 40), (10, 1)).astype(np.float32)
+    valid = np.ones_like(distance, bool)
+    valid[0] = False
+    distance[1], distance[2] = np.nan, 0
+    picture = colored_distance(distance, valid)
+    assert not picture[:3].any()
+    grey = picture[5].astype(float).sum(-1)
+    assert grey[0] > 2 * grey[-1] and (np.diff(grey[::8]) < 0).all()
+    assert picture[5, 0, 0] > 200 and picture[5, 0, 2] < 100  # yellow
+    assert not colored_distance(distance, np.zeros_like(valid)).any()
+
+
+def test_a_given_range_makes_pictures_comparable():
+    near, far = (np.full((4, 4), d, np.float32) for d in (10.0, 40.0))
+    all_valid = np.ones((4, 4), bool)
+    one, two = (colored_distance(d, all_valid, (5, 50)) for d in (near, far))
+    assert not np.array_equal(one, two)
+    assert np.array_equal(one, colored_distance(near, all_valid, (5, 50)))
+
+
+def test_points_are_drawn_at_their_pixels_in_their_colours():
+    image = np.zeros((100, 200, 3), np.float32)
+    picture = marked_points(image, [(np.array([[50.5, 50.5]]), GOOD), (np.array([[150.5, 20.5]]), BAD)], width=200)
+    assert tuple(picture[50, 50]) == GOOD and tuple(picture[20, 150]) == BAD
+    assert (picture.any(-1)).sum() < 80
+    assert tuple(marked_points(image, [(np.array([[50.5, 50.5]]), GOOD)], width=400)[100, 100]) == GOOD
+    assert not marked_points(image, [(np.zeros((0, 2)), GOOD)]).any()
+
+
+def test_images_in_a_row_have_one_height_and_white_between():
+    row = side_by_side([np.zeros((20, 10, 3), np.uint8), np.zeros((40, 40, 3), np.uint8)], gap=6)
+    assert row.shape == (20, 10 + 6 + 20, 3)
+    assert (row[:, 10:16] == 255).all() and not row[:, :10].any() and not row[:, 16:].any()
+
+
+def test_a_mesh_is_seen_from_outside_and_from_a_place_of_its_own():
+    mesh = trimesh.creation.icosphere(3, 2.0)
+    vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    colors = np.tile([1.0, 0.2, 0.2], (len(vertices), 1))
+    outside = mesh_picture(vertices, triangles, colors, (80, 60))
+    assert (outside[0, 0] == 255).all() and outside[30, 40, 0] > 1.5 * outside[30, 40, 1]
+    inside = mesh_picture(vertices, triangles, colors, (80, 60), np.zeros(3), np.eye(3))
+    assert not (inside == 255).all(-1).any()
+    away = mesh_picture(vertices, triangles, colors, (80, 60), np.array([0, 0, 10.0]), np.eye(3))
+    assert (away == 255).all()
+
+
+def test_a_mesh_of_nothing_is_a_white_picture():
+    empty = np.zeros((0, 3))
+    assert (mesh_picture(empty, empty.astype(int), empty, (8, 6)) == 255).all()
+
+
+def test_a_chart_needs_no_display(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    figure, axes = chart((2.0, 1.0))
+    axes.plot([1, 2, 3])
+    assert decoded(chart_png(figure)).shape == (110, 220, 3)

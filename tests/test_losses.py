@@ -1,0 +1,241 @@
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from lightdepth.frame import FrameBatch
+from lightdepth.geometry import normals_from_distance
+from lightdepth.losses import (
+    LossConfig,
+    brightness_residual,
+    chroma_loss,
+    facing_loss,
+    masked_mean,
+    masked_median,
+    photometric_loss,
+    render_image,
+    rendered_log_brightness,
+    saturated_loss,
+    self_supervised_loss,
+    smoothness_loss,
+    supervised_loss,
+    training_loss,
+)
+from lightdepth.photometry import LightTerms, PhotometricCalibration, encode, hue_saturation_albedo
+
+LAMBERT = LossConfig(cosine_exponent=1.0, reflectance=0.0, cosine_floor=0.0)
+
+
+def pinhole_rays(height: int, width: int, batch: int = 1) -> torch.Tensor:
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    rays = torch.stack([(u - width / 2) / width, (v - height / 2) / width, torch.ones_like(u)])
+    return F.normalize(rays, dim=0).expand(batch, -1, -1, -1)
+
+
+def tube_distance(rays: torch.Tensor, radius: float = 1.5, end: float = 5.0) -> torch.Tensor:
+    """Inside a cylinder around the optical axis, closed at z = end."""
+    wall = radius / rays[:, :2].norm(dim=1, keepdim=True).clamp(min=1e-6)
+    return torch.minimum(wall, end / rays[:, 2:3])
+
+
+def tube_batch(height: int = 32, width: int = 40, gain: float = 1.0, config: LossConfig = LAMBERT, batch: int = 2):
+    """Images that the loss's own model of light makes of a cylinder, of one colour; and that colour."""
+    rays = pinhole_rays(height, width, batch)
+    distance = tube_distance(rays)
+    light = LightTerms(*(t.expand(batch, *t.shape[1:]) for t in PhotometricCalibration().terms()))
+    mask = torch.ones(batch, 1, height, width, dtype=torch.bool)
+    colour = torch.tensor([0.55, 0.4]).reshape(1, 2, 1, 1).expand(batch, 2, height, width)
+    log_v = rendered_log_brightness(distance, normals_from_distance(distance, rays), rays, mask, light, config)
+    image = log_v.exp() * encode(hue_saturation_albedo(colour), light.gamma) * gain ** (1 / 2.2)
+    return FrameBatch(image.clamp(0, 1), mask, rays, light, distance, mask), colour
+
+
+def spoilt(distance: torch.Tensor) -> torch.Tensor:
+    """The same with a smooth error of some 20 %."""
+    return distance * torch.exp(0.3 * torch.linspace(-1, 1, distance.shape[-1])) * 1.1
+
+
+@pytest.mark.parametrize("reflectance", [0.0, 0.6])
+def test_truth_has_less_loss_than_a_wrong_distance_where_the_model_holds(reflectance):
+    config = replace(LAMBERT, reflectance=reflectance)
+    batch, colour = tube_batch(config=config)
+    total, terms = self_supervised_loss(batch.true_distance, colour, batch, config)
+    wrong, wrong_terms = self_supervised_loss(spoilt(batch.true_distance), colour, batch, config)
+    assert terms["photometric"] < 1e-3 and terms["chroma"] < 0.02
+    assert wrong > total and wrong_terms["photometric"] > 20 * terms["photometric"]
+
+
+def test_the_loss_does_not_see_gain_nor_the_scale_of_distance():
+    config = LossConfig()
+    dim, colour = tube_batch(gain=1.0)
+    dimmer, _ = tube_batch(gain=0.5)
+    distance = spoilt(dim.true_distance)
+    reference, _ = self_supervised_loss(distance, colour, dim, config)
+    assert torch.allclose(self_supervised_loss(distance * 30, colour, dim, config)[0], reference, rtol=1e-3)
+    assert torch.allclose(self_supervised_loss(distance, colour, dimmer, config)[0], reference, rtol=1e-2)
+
+
+def test_reflectance_comes_from_the_configuration_or_else_from_the_light():
+    batch, colour = tube_batch()
+    lit = batch._replace(light=batch.light._replace(reflectance=torch.full_like(batch.light.reflectance, 0.5)))
+    fixed = self_supervised_loss(batch.true_distance, colour, batch, LossConfig(reflectance=0.5))[0]
+    calibrated = self_supervised_loss(batch.true_distance, colour, lit, LossConfig(reflectance=None))[0]
+    none = self_supervised_loss(batch.true_distance, colour, batch, LossConfig(reflectance=None))[0]
+    assert torch.allclose(fixed, calibrated) and not torch.allclose(fixed, none)
+
+
+def test_the_lights_offset_plays_no_part_because_distance_has_only_a_scale():
+    batch, colour = tube_batch()
+    moved = batch._replace(light=batch.light._replace(position=torch.full_like(batch.light.position, 2.0)))
+    first = self_supervised_loss(batch.true_distance, colour, batch, LossConfig())[0]
+    assert torch.equal(first, self_supervised_loss(batch.true_distance, colour, moved, LossConfig())[0])
+
+
+def test_saturated_pixels_may_be_rendered_brighter_but_not_darker():
+    everywhere = torch.ones(1, 1, 4, 4, dtype=torch.bool)
+    saturated = everywhere.clone()
+    saturated[..., :2] = False
+    brighter, darker = torch.full((1, 1, 4, 4), -0.5), torch.full((1, 1, 4, 4), 0.5)
+    assert saturated_loss(brighter, saturated, ~saturated, 0.05) == 0
+    assert torch.isclose(saturated_loss(darker, saturated, ~saturated, 0.05), torch.tensor(0.475))
+    assert saturated_loss(darker, everywhere, ~everywhere, 0.05) == 0  # no pixel left to know the gain from
+
+
+def test_facing_punishes_only_grazing_surfaces():
+    rays = pinhole_rays(6, 8)
+    mask = torch.ones(1, 1, 6, 8, dtype=torch.bool)
+    assert facing_loss(-rays, rays, mask, 0.03) == 0
+    across = F.normalize(torch.linalg.cross(rays, torch.tensor([0.0, 1, 0]).reshape(1, 3, 1, 1).expand_as(rays), dim=1))
+    assert torch.isclose(facing_loss(across, rays, mask, 0.03), torch.tensor(0.03), atol=1e-5)
+
+
+def test_smoothness_is_zero_for_log_linear_distance_and_forgives_bends_at_edges():
+    mask = torch.ones(1, 1, 20, 24, dtype=torch.bool)
+    flat = torch.zeros(1, 1, 20, 24)
+    ramp = torch.linspace(0, 1, 24).expand(1, 1, 20, 24)
+    step = (torch.arange(24) >= 12).float().expand(1, 1, 20, 24)
+    assert smoothness_loss(ramp, flat, mask) < 1e-6
+    assert smoothness_loss(step, step * 3, mask) < smoothness_loss(step, flat, mask) * 0.5
+
+
+def test_smoothness_of_a_surface_hardly_depends_on_the_resolution():
+    def value(rows: int) -> torch.Tensor:
+        v = torch.linspace(0, 6, rows).reshape(1, 1, rows, 1).expand(1, 1, rows, rows)
+        return smoothness_loss(v.sin(), 0 * v, torch.ones_like(v, dtype=torch.bool))
+
+    assert torch.isclose(value(112), value(224), rtol=0.05)
+
+
+def test_chroma_is_zero_for_the_right_colour_at_any_brightness():
+    batch, colour = tube_batch(gain=1.0)
+    assert chroma_loss(colour, batch.image, batch.light, batch.mask) < 1e-4
+    assert chroma_loss(colour * 0.5, batch.image, batch.light, batch.mask) > 0.1
+
+
+def test_supervised_terms_vanish_at_truth_times_any_scale():
+    batch, _ = tube_batch()
+    right = supervised_loss(batch.true_distance * 7, batch.true_distance, batch.true_valid)
+    wrong = supervised_loss(spoilt(batch.true_distance), batch.true_distance, batch.true_valid)
+    assert all(value < 1e-5 for value in right.values())
+    assert all(wrong[name] > 0.01 for name in right)
+
+
+def test_truth_is_not_read_unless_it_is_given_a_weight():
+    batch, colour = tube_batch()
+    poisoned = batch._replace(true_distance=batch.true_distance * torch.nan)
+    distance = spoilt(batch.true_distance)
+    total, terms = training_loss(distance, colour, poisoned, LossConfig())
+    assert torch.isfinite(total) and "supervised" not in terms
+    with_truth, terms = training_loss(distance, colour, batch, LossConfig(supervised=1.0))
+    assert with_truth > total and "supervised" in terms
+
+
+def blackened(batch):
+    return batch._replace(image=torch.zeros_like(batch.image))
+
+
+def whitened(batch):
+    return batch._replace(image=torch.ones_like(batch.image))
+
+
+def masked_away(batch):
+    return batch._replace(mask=torch.zeros_like(batch.mask), true_valid=torch.zeros_like(batch.mask))
+
+
+def without_corners(batch):
+    """Corners masked, their rays not rays of any lens: what to_batch makes of an octagon."""
+    mask, rays = batch.mask.clone(), batch.rays.clone()
+    mask[..., :9, :9] = False
+    rays[..., :9, :9] = torch.tensor([0.0, 0, 1]).reshape(3, 1, 1)
+    return batch._replace(mask=mask, rays=rays, image=batch.image * mask, true_valid=mask)
+
+
+def half_black(batch):
+    image = batch.image.clone()
+    image[0] = 0
+    return batch._replace(image=image)
+
+
+@pytest.mark.parametrize("spoil", [blackened, whitened, masked_away, without_corners, half_black])
+@pytest.mark.parametrize("flat", [True, False])
+def test_degenerate_images_give_finite_losses_and_gradients(spoil, flat):
+    batch, _ = tube_batch()
+    batch = spoil(batch)
+    raw = (torch.zeros_like(batch.true_distance) if flat else spoilt(batch.true_distance).log()).requires_grad_()
+    colour = torch.zeros(2, 2, 32, 40, requires_grad=True)
+    total, terms = training_loss(raw.exp(), colour.sigmoid(), batch, LossConfig(supervised=1.0))
+    total.backward()
+    assert torch.isfinite(total) and all(torch.isfinite(value) for value in terms.values())
+    assert torch.isfinite(raw.grad).all() and torch.isfinite(colour.grad).all()
+
+
+def test_gradient_of_the_direct_model_agrees_with_differences():
+    batch, _ = tube_batch(4, 5, batch=1)
+    double = FrameBatch(
+        *(
+            LightTerms(*(t.double() for t in x)) if isinstance(x, tuple) else x.double() if x.is_floating_point() else x
+            for x in batch
+        )
+    )
+
+    def residual(log_distance):
+        distance = log_distance.exp()
+        normals = normals_from_distance(distance, double.rays)
+        return rendered_log_brightness(distance, normals, double.rays, double.mask, double.light, LAMBERT)
+
+    log_distance = double.true_distance.log() + 0.05 * torch.sin(torch.arange(20).reshape(1, 1, 4, 5))
+    assert torch.autograd.gradcheck(residual, log_distance.double().requires_grad_())
+
+
+def test_masked_median_and_mean_agree_with_torch_on_what_is_inside():
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(3, 1, 5, 7, generator=generator)
+    mask = torch.rand(3, 1, 5, 7, generator=generator) < 0.6
+    mask[2] = False
+    values[~mask] = torch.nan
+    median = masked_median(values, mask).flatten()
+    assert torch.equal(median[:2], torch.stack([values[i][mask[i]].median() for i in range(2)])) and median[2] == 0
+    expected = (values[0][mask[0]].mean() + values[1][mask[1]].mean()) / 3
+    assert torch.isclose(masked_mean(values, mask), expected)
+
+
+def test_photometric_is_huber_over_its_width():
+    residual = torch.tensor([0.01, -1.0]).reshape(1, 1, 1, 2)
+    usable = torch.ones_like(residual, dtype=torch.bool)
+    expected = (0.5 * 0.01**2 / 0.05 + (1.0 - 0.025)) / 2
+    assert torch.isclose(photometric_loss(residual, usable, 0.05), torch.tensor(expected))
+    assert torch.equal(brightness_residual(residual, residual, usable), torch.zeros_like(residual))
+
+
+def test_rendering_the_truth_gives_back_the_image():
+    batch, colour = tube_batch(gain=0.5)
+    assert (render_image(batch.true_distance, colour, batch, LAMBERT) - batch.image).abs().max() < 0.01
+
+
+def test_the_total_is_the_weighted_sum_of_its_terms():
+    batch, colour = tube_batch()
+    config = LossConfig(photometric=2.0, smoothness=3.0)
+    total, terms = self_supervised_loss(spoilt(batch.true_distance), colour, batch, config)
+    weights = asdict(config)
+    assert torch.isclose(total, sum(weights[name] * value for name, value in terms.items()))

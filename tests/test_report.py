@@ -1,0 +1,130 @@
+"""The report is one file that needs nothing from anywhere, and says what went wrong."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from colons import colon, sequence, slam, truth
+
+from densify.page import Gallery, densify_page
+from densify.pipeline import DensifyConfig, densify
+from lightdepth.figures import png
+from lightdepth.predict import ConstantModel
+from lightdepth.report import Report, number
+
+PIXEL = png(np.zeros((1, 1, 3), np.uint8))
+
+
+class References(HTMLParser):
+    """Every address that a page would load or lead to, and its tags."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.found: list[str] = []
+        self.tags: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.found += [value for name, value in attrs if name in ("src", "href", "srcset", "data", "action") and value]
+
+
+def check_self_contained(path: Path) -> References:
+    text = path.read_text()
+    page = References(text)
+    assert all(address.startswith("data:image/png;base64,") for address in page.found)
+    assert not {"script", "link", "iframe", "base"} & set(page.tags)
+    assert not re.search(r"https?://|url\(|@import", text)
+    for address in page.found:
+        assert base64.b64decode(address.split(",", 1)[1]).startswith(b"\x89PNG")
+    return page
+
+
+def test_a_page_has_its_parts_in_order_and_loads_nothing(tmp_path):
+    page = Report("Title & more")
+    page.heading("First")
+    page.text("a < b")
+    page.table(["what", "mm"], [["sparse", 1.23456], ["dense", None]])
+    page.figures([(PIXEL, 'a "caption"'), (PIXEL, "another")])
+    page.write(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert len(check_self_contained(tmp_path / "report.html").found) == 2
+    parts = ["Title &amp; more</h1>", "First</h2>", "a &lt; b", "<table>", ">1.23<", ">–<", "a &quot;caption&quot;"]
+    assert [text.index(p) for p in parts] == sorted(text.index(p) for p in parts)
+    assert text.startswith("<!doctype html>") and [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_what_comes_from_files_cannot_become_markup(tmp_path):
+    page = Report("<script>alert(1)</script>")
+    for add in (page.heading, page.text):
+        add("<img src=http://x>")
+    page.table(["<b>"], [["<i>"]])
+    page.figures([(PIXEL, '"><script>')])
+    page.write(tmp_path / "report.html")
+    assert set(References((tmp_path / "report.html").read_text()).tags) <= {
+        *("html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "div", "figure", "figcaption", "img"),
+        *("table", "thead", "tbody", "tr", "th", "td"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(3, "3"), (1.23456, "1.23"), (0.000123456, "0.000123"), (12345.6, "12346"), (None, "–"), (float("nan"), "–")],
+)
+def test_numbers_are_shown_for_people(value, text):
+    assert number(value) == text
+    assert number(np.float64(value) if isinstance(value, float) else value) == text
+
+
+@pytest.fixture(scope="module")
+def made():
+    frames = colon(0).frames[:4]
+    found = slam(frames, maps=1).map
+    gallery = Gallery(found)
+    results = densify(sequence(frames), found, truth, DensifyConfig(), gallery)
+    return results, densify(sequence(frames), found, ConstantModel(), DensifyConfig()), gallery
+
+
+def test_the_report_of_a_run_shows_surfaces_scales_points_and_withheld_errors(made, tmp_path):
+    results, baselines, gallery = made
+    densify_page("Maps", results, baselines, gallery, ["a note"]).write(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    page = check_self_contained(tmp_path / "report.html")
+    assert len(page.found) == 2 + 1 + len(gallery.pictures[0]) >= 5
+    for part in ("a note", "4 of 4", "Withheld points", "constant distance", "Scale of each keyframe", "Time"):
+        assert part in text
+    assert "Errors against the truth" not in text
+
+
+def test_the_report_names_keyframes_that_were_left_out_and_maps_that_could_not_be_judged(made, tmp_path):
+    (result,), _, gallery = made
+    failed = replace(result.dense.alignments[1], reason="sigma is 50% of the median distance")
+    dense = replace(result.dense, alignments=(result.dense.alignments[0], failed, *result.dense.alignments[2:]))
+    evaluation = {
+        "maps": [
+            {"map": 0, "rms_ate_mm": 0.12, "dense": {"points": 9, "rms_mm": 1.5, "median_mm": 0.7}, "sparse": None},
+            {"map": 1, "error": "2 common poses"},
+        ]
+    }
+    page = densify_page("Maps", [replace(result, dense=dense, withheld=None)], [], gallery, [], evaluation)
+    page.write(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert "000001.png left out: sigma is 50% of the median distance" in text and "3 of 4" in text
+    assert "Map 1 could not be evaluated: 2 common poses" in text and ">1.5<" in text
+    assert "Withheld points" not in text
+
+
+def test_an_empty_surface_has_a_report_too(made, tmp_path):
+    (result,), _, gallery = made
+    empty = np.zeros((0, 3))
+    alignments = tuple(replace(a, reason="no") for a in result.dense.alignments)
+    dense = replace(result.dense, vertices=empty, triangles=empty.astype(int), colors=empty, alignments=alignments)
+    densify_page("Maps", [replace(result, dense=dense)], [], gallery, []).write(tmp_path / "report.html")
+    check_self_contained(tmp_path / "report.html")
+    assert "0 of 4" in (tmp_path / "report.html").read_text()

@@ -1,0 +1,1 @@
+"""A dataset in, a checkpoint out. Nobody imports it as a library."""

@@ -1,0 +1,74 @@
+"""`lightdepth train`."""
+
+from __future__ import annotations
+
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+TRAINER_DEFAULTS = {
+    "trainer.max_steps": 1500,
+    "trainer.val_check_interval": 250,
+    "trainer.check_val_every_n_epoch": None,  # so that the interval counts steps, not epochs
+    "trainer.num_sanity_val_steps": 0,
+    "trainer.gradient_clip_val": 1.0,
+    "trainer.log_every_n_steps": 10,
+    "trainer.enable_model_summary": False,
+}
+
+
+def train(argv: list[str] | None = None) -> int:
+    """Train a depth network on frames alone, from the decline of the light.
+
+    `lightdepth train --config C -o RUN [--resume | --overwrite] [overrides]`: every option of the data, the model and
+    Lightning's Trainer is a dotted override. `--resume` without --config takes the run's own config.yaml.
+    """
+    import lightning.pytorch as pl
+    from jsonargparse import ArgumentParser
+
+    from lightdepth.module import LightDepth
+
+    from .datamodule import FrameDataModule
+    from .fit import check_output, fit
+
+    given = list(sys.argv[1:] if argv is None else argv)
+    parser = ArgumentParser(
+        prog="lightdepth train", description="Train LightDepth without ground truth.", allow_abbrev=False
+    )
+    parser.add_argument(
+        "--config", action="config", help="YAML with any of the options below, e.g. configs/train/*.yaml"
+    )
+    parser.add_argument("-o", "--output", required=True, help="folder of the run")
+    parser.add_argument("--resume", action="store_true", help="go on from OUTPUT/checkpoints/last.ckpt")
+    parser.add_argument("--overwrite", action="store_true", help="replace a run that is already there")
+    parser.add_argument("--seed", type=int, default=0, help="of weights, colons, order and augmentation")
+    parser.add_class_arguments(LightDepth, "model")
+    parser.add_class_arguments(FrameDataModule, "data")
+    parser.add_class_arguments(pl.Trainer, "trainer", instantiate=False, skip={"default_root_dir"})
+    parser.link_arguments("seed", "data.seed")
+    parser.link_arguments("data.size", "model.rows", compute_fn=lambda size: size[1])
+    parser.set_defaults(TRAINER_DEFAULTS)
+    config = parser.parse_args(_with_own_config(given))
+
+    output = Path(config.output)
+    check_output(output, config.resume, config.overwrite)  # before the seconds that the rest takes
+    kept = config.clone()
+    for key in ("config", "output", "resume", "overwrite"):
+        kept.pop(key, None)
+    pl.seed_everything(config.seed, workers=True, verbose=False)
+    made = parser.instantiate(config)
+    text = parser.dump(kept, skip_validation=True)
+    flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given}
+    fit(made.model, made.data, output, vars(made.trainer), text, config.seed, **flags)
+    return 0
+
+
+def _with_own_config(argv: list[str]) -> list[str]:
+    """`--resume` without --config takes the config.yaml of the run."""
+    if "--resume" not in argv or any(a == "--config" or a.startswith("--config=") for a in argv):
+        return argv
+    for flag, value in pairwise([*argv, ""]):
+        folder = flag.partition("=")[2] if flag.startswith("--output=") else value if flag in ("-o", "--output") else ""
+        if folder and (Path(folder) / "config.yaml").is_file():
+            return ["--config", str(Path(folder) / "config.yaml"), *argv]
+    return argv

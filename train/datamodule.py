@@ -1,0 +1,283 @@
+"""What a training run sees: frames read from disk, synthetic colons made on the spot, or both.
+
+Everything random follows from `seed`: the order of the frames from the epoch, the augmentation from the step, so that a
+resumed run sees what an uninterrupted one would have seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import ConcatDataset, DataLoader, Dataset, Sampler
+
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame, FrameBatch, to_batch
+from lightdepth.photometry import LightTerms, decode, encode
+from lightdepth.progress import Progress
+
+
+@dataclass(frozen=True)
+class TubeData:
+    """Synthetic colons for training, drawn from the data's seed; validation scenes are others.
+
+    Args:
+        scenes: colons to train on, each with its own shape, texture and endoscope; 0 for none.
+        val_scenes: colons to validate on.
+        frames: per colon.
+        travel: mm along the colon over which its frames are spread.
+        lenses: in turn: c3vd, fisheye, pinhole.
+        mu: ends of the range of the light's spread.
+        gamma: ends of the range of the response.
+        reflectance: ends of the range of the wall's reflectance.
+    """
+
+    scenes: int = 0
+    val_scenes: int = 0
+    frames: int = 8
+    travel: float = 60.0
+    lenses: tuple[str, ...] = ("c3vd", "fisheye", "pinhole")
+    mu: tuple[float, float] = (0.0, 3.5)
+    gamma: tuple[float, float] = (1.8, 2.6)
+    reflectance: tuple[float, float] = (0.0, 0.7)
+
+
+_NO_TUBE = TubeData()
+_VAL_SEEDS = 1_000_000  # validation colons are drawn from here on, so that more scenes never run into them
+_SEEDS_APART = 10_000
+
+
+class FrameDataModule(pl.LightningDataModule):
+    """Training and validation frames, as FrameBatches of one size.
+
+    Args:
+        sequences: folders to train on.
+        val_sequences: folders to validate on; without any, the last tenth of each training sequence is held out.
+        frames: a file with one frame name a line; training takes only these.
+        tube: synthetic colons.
+        size: width and height of the images, pixels.
+        batch_size: frames in a step.
+        num_workers: processes that read frames.
+        augment: exposure and flips.
+        seed: of colons, order and augmentation.
+    """
+
+    def __init__(
+        self,
+        sequences: list[str] | None = None,
+        val_sequences: list[str] | None = None,
+        frames: str | None = None,
+        tube: TubeData = _NO_TUBE,
+        size: tuple[int, int] = (160, 128),
+        batch_size: int = 4,
+        num_workers: int = 0,
+        augment: bool = True,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.sequences, self.val_sequences = sequences or [], val_sequences or []
+        self.frames, self.tube, self.seed = frames, tube, seed
+        self.size, self.batch_size, self.num_workers = (int(size[0]), int(size[1])), batch_size, num_workers
+        self.augment = augment
+        if min(*self.size, batch_size) < 1:
+            raise InputError(f"data: size {self.size}, batch_size {batch_size}; expected positive numbers")
+        self._train: ConcatDataset | None = None
+        self._val: ConcatDataset | None = None
+
+    def setup(self, stage: str | None = None) -> None:
+        if self._train is not None:
+            return
+        train: list[Dataset] = []
+        val: list[Dataset] = []
+        wanted = None if self.frames is None else read_frame_list(Path(self.frames))
+        for path in self.sequences:
+            chosen = _chosen(_open(path), wanted, path)
+            held_out = 0 if self.val_sequences else max(1, len(chosen) // 10)
+            if len(chosen) <= held_out:
+                raise InputError(f"{path}: {len(chosen)} frame; expected at least two, one of them to validate on")
+            train.append(_Frames(chosen[: len(chosen) - held_out], self.size))
+            if held_out:
+                val.append(_Frames(chosen[-held_out:], self.size))
+        val += [_Frames(_chosen(_open(path), None, path), self.size) for path in self.val_sequences]
+        if self.tube.scenes + self.tube.val_scenes > 0:
+            with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
+                first = self.seed * _SEEDS_APART
+                train += self._colons(first, self.tube.scenes, bar)
+                val += self._colons(first + _VAL_SEEDS, self.tube.val_scenes, bar)
+        if not train:
+            raise InputError("nothing to train on; give --data.sequences FOLDER, or --data.tube.scenes N")
+        if not val:
+            raise InputError("nothing to validate on; give --data.val_sequences FOLDER, or --data.tube.val_scenes N")
+        self._train, self._val = ConcatDataset(train), ConcatDataset(val)
+
+    def _colons(self, first_seed: int, count: int, bar: Progress) -> list[Dataset]:
+        made: list[Dataset] = []
+        for i in range(count):
+            made.append(_Cached(tube_scene(self.tube, first_seed + i, i, self.size)))
+            bar.advance()
+        return made
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of frames to train and to validate on."""
+        assert self._train is not None and self._val is not None, "setup() first"
+        return {"train": len(self._train), "val": len(self._val)}
+
+    def train_dataloader(self) -> DataLoader:
+        assert self._train is not None
+        sampler = _Shuffled(len(self._train), self.seed)
+        full = len(self._train) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
+        return self._loader(self._train, sampler=sampler, drop_last=full)
+
+    def val_dataloader(self) -> DataLoader:
+        assert self._val is not None
+        return self._loader(self._val, shuffle=False)
+
+    def on_after_batch_transfer(self, batch: FrameBatch, dataloader_idx: int) -> FrameBatch:
+        trainer = self.trainer
+        if not self.augment or trainer is None or not trainer.training:
+            return batch
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + trainer.global_step)
+        return augmented(batch, generator)
+
+    def _loader(self, dataset: Dataset, **options: Any) -> DataLoader:
+        return DataLoader(
+            dataset,
+            batch_size=self.batch_size,
+            num_workers=self.num_workers,
+            persistent_workers=self.num_workers > 0,
+            collate_fn=collate,
+            **options,
+        )
+
+
+def collate(batches: Sequence[FrameBatch]) -> FrameBatch:
+    """One batch out of batches."""
+    columns = zip(*(batch[:3] + batch[4:] for batch in batches), strict=True)
+    image, mask, rays, true_distance, true_valid = (torch.cat(column) for column in columns)
+    light = LightTerms(*(torch.cat(column) for column in zip(*(batch.light for batch in batches), strict=True)))
+    return FrameBatch(image, mask, rays, light, true_distance, true_valid)
+
+
+def flipped(batch: FrameBatch, chosen: Tensor, axis: int) -> FrameBatch:
+    """The chosen (B,) bool images in a mirror: axis 0 left for right, axis 1 top for bottom.
+
+    Everything is mirrored, rays and light with the image, so that what is seen stays physically right.
+    """
+    which = chosen.reshape(-1, 1, 1, 1)
+    sign = torch.ones(1, 3, 1, 1, device=batch.image.device)
+    sign[:, axis] = -1
+    sign = torch.where(which, sign, 1.0)
+
+    def mirror(tensor: Tensor) -> Tensor:
+        return torch.where(which, tensor.flip(-1 - axis), tensor)
+
+    light = batch.light._replace(position=batch.light.position * sign, direction=batch.light.direction * sign)
+    return FrameBatch(
+        image=mirror(batch.image),
+        mask=mirror(batch.mask),
+        rays=mirror(batch.rays) * sign,
+        light=light,
+        true_distance=mirror(batch.true_distance),
+        true_valid=mirror(batch.true_valid),
+    )
+
+
+def augmented(batch: FrameBatch, generator: torch.Generator) -> FrameBatch:
+    """Flips along both axes, each with probability 1/2, and linear exposure times exp(0.1 N), clipped at white."""
+    count, device = len(batch.image), batch.image.device
+    for axis in (0, 1):
+        batch = flipped(batch, (torch.rand(count, generator=generator) < 0.5).to(device), axis)
+    exposure = torch.exp(0.1 * torch.randn(count, 1, 1, 1, generator=generator)).to(device)
+    gamma = batch.light.gamma
+    return batch._replace(image=encode(exposure * decode(batch.image, gamma), gamma).clamp(max=1))
+
+
+def tube_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> list[FrameBatch]:
+    """The frames of one synthetic colon, as batches of one."""
+    from lightdepth.tube import TubeConfig, lens, tube_frames
+
+    camera = lens(tube.lenses[index % len(tube.lenses)], *size)
+    config = TubeConfig()
+    config = replace(config, sensor=replace(config.sensor, mu=tube.mu, gamma=tube.gamma, reflectance=tube.reflectance))
+    return [to_batch(f, size) for f in tube_frames(seed, tube.frames, camera, travel=tube.travel, config=config)]
+
+
+def read_frame_list(path: Path) -> list[str]:
+    """Frame names, one a line; empty lines and lines that start with # are skipped."""
+    try:
+        lines = [line.strip() for line in path.read_text().splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a list of frame names ({error})") from error
+    names = [line for line in lines if line and not line.startswith("#")]
+    if not names:
+        raise InputError(f"{path}: no frame names in it; expected one a line, as `lightdepth select` writes")
+    return names
+
+
+def _open(path: str) -> Sequence[Frame]:
+    from lightdepth.datasets import open_sequence
+
+    return open_sequence(Path(path))
+
+
+def _chosen(frames: Sequence[Frame], wanted: list[str] | None, path: str) -> list[Callable[[], Frame]]:
+    """Readers of the frames whose name (or its last part) is on the list, or of all."""
+
+    def reader(index: int) -> Callable[[], Frame]:
+        return lambda: frames[index]
+
+    if wanted is None:
+        return [reader(i) for i in range(len(frames))]
+    names = getattr(frames, "names", None) or [frame.name for frame in frames]
+    listed = {Path(name).stem for name in wanted}
+    found = [reader(i) for i, name in enumerate(names) if Path(name).stem in listed]
+    if not found:
+        raise InputError(f"{path}: none of the {len(wanted)} listed frames is in it; its first is {names[0]}")
+    return found
+
+
+class _Frames(Dataset):
+    """Frames read when asked for, at one size."""
+
+    def __init__(self, readers: list[Callable[[], Frame]], size: tuple[int, int]) -> None:
+        self.readers, self.size = readers, size
+
+    def __len__(self) -> int:
+        return len(self.readers)
+
+    def __getitem__(self, index: int) -> FrameBatch:
+        return to_batch(self.readers[index](), self.size)
+
+
+class _Cached(Dataset):
+    def __init__(self, batches: list[FrameBatch]) -> None:
+        self.batches = batches
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __getitem__(self, index: int) -> FrameBatch:
+        return self.batches[index]
+
+
+class _Shuffled(Sampler[int]):
+    """A new order every epoch, which follows from seed and epoch. Lightning calls `set_epoch`."""
+
+    def __init__(self, count: int, seed: int) -> None:
+        self.count, self.seed, self.epoch = count, seed, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(np.random.default_rng((self.seed, self.epoch)).permutation(self.count).tolist())
