@@ -78,7 +78,7 @@ def _parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
         parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run made there")
     declared: set[str | int] = {name for name in ("output", "overwrite") if name in parameters}
     parser.add_function_arguments(function, as_positional=True, sub_configs=True, skip=declared)
-    values = parser.instantiate_classes(parser.parse_args([_underscored(a) for a in argv]))
+    values = parser.instantiate(parser.parse_args([_underscored(a) for a in argv]))
     return {name: values[name] for name in parameters}
 
 

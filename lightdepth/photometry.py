@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from lightdepth.errors import InputError
+from lightdepth.geometry import length
 
 DEFAULT_GAMMA, DEFAULT_MU = 2.2, 2.767
 
@@ -101,8 +102,8 @@ class LightTerms(NamedTuple):
 def light_distance(distance: Tensor, rays: Tensor, light: LightTerms) -> tuple[Tensor, Tensor]:
     """|x - P| (B, 1, H, W) and l (B, 3, H, W)."""
     from_light = distance * rays - light.position
-    length = from_light.norm(dim=-3, keepdim=True)
-    return length, from_light / length.clamp(min=1e-12)
+    reach = length(from_light)
+    return reach, from_light / reach
 
 
 def spread(towards: Tensor, light: LightTerms) -> Tensor:

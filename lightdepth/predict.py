@@ -46,7 +46,7 @@ class DeclineModel:
 
     name = "decline"
 
-    def __init__(self, rows: int = 512, blur: float = BLUR, details: bool = True) -> None:
+    def __init__(self, rows: int = 256, blur: float = BLUR, details: bool = True) -> None:
         self.rows, self.blur, self.details = rows, blur, details
 
     @torch.inference_mode()
