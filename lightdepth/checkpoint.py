@@ -58,17 +58,22 @@ def load_model(name_or_path: str | Path = DEFAULT_CHECKPOINT, details: bool = Tr
     if name == "constant":
         return ConstantModel()
     if name in bundled():
-        return _load_safetensors(_WEIGHTS / f"{name}.safetensors", name, details)
+        return _placed(_load_safetensors(_WEIGHTS / f"{name}.safetensors", name, details))
     path = Path(name_or_path)
     if not path.is_file():
         known = ", ".join([*bundled(), *TRAINING_FREE])
         what = "is a folder" if path.is_dir() else "no such checkpoint"
         raise InputError(f"{name}: {what}; expected a .safetensors or .ckpt file, or one of {known}")
     if path.suffix == ".safetensors":
-        return _load_safetensors(path, path.stem, details)
+        return _placed(_load_safetensors(path, path.stem, details))
     if path.suffix == ".ckpt":
-        return _load_lightning(path, details)
+        return _placed(_load_lightning(path, details))
     raise InputError(f"{name}: unknown kind of checkpoint; expected a name that ends in .safetensors or .ckpt")
+
+
+def _placed(model: NetworkModel) -> NetworkModel:
+    """The model on the GPU where there is one."""
+    return model.to("cuda") if torch.cuda.is_available() else model
 
 
 def read_card(path: Path | str) -> dict[str, Any]:
