@@ -1,4 +1,4 @@
-"""Calibration files: camera.json and light.json."""
+"""camera.json and light.json: our own calibration files, and JSON with the file named in every error."""
 
 from __future__ import annotations
 
@@ -59,29 +59,33 @@ def _checked(schema: type[BaseModel], data: Any, where: str) -> Any:
         raise InputError(f"{where}: {field}: {first['msg']}") from error
 
 
-def read_camera(path: Path) -> CameraModel:
+def read_camera_json(path: Path) -> CameraModel:
     """camera.json -> camera, brought to our pixel convention."""
     found = _checked(_CameraFile, read_json(path), str(path))
     camera = camera_from_params(found.model, found.width, found.height, found.params, str(path))
     return camera.with_pixel_center(found.pixel_center)
 
 
-def write_camera(camera: CameraModel, path: Path) -> None:
+def write_camera_json(camera: CameraModel, path: Path) -> None:
     data = {"model": camera.name, "width": camera.width, "height": camera.height, "params": list(camera.params)}
     Path(path).write_text(json.dumps({**data, "pixel_center": 0.5}, indent=1) + "\n")
 
 
-def read_light(source: str | Path) -> PhotometricCalibration:
-    """A light.json file, or values written out as `gamma=2.2,mu=0`."""
-    text = str(source)
-    if "=" in text and not Path(text).exists():
-        where = f"--light {text}"
-        pairs = [[side.strip() for side in part.split("=", 1)] for part in text.split(",")]
-        if any(len(pair) != 2 for pair in pairs):
-            raise InputError(f"{where}: expected name=number pairs such as gamma=2.2,mu=0; vectors need a light.json")
-        data: Any = dict(pairs)
-    else:
-        where, data = text, read_json(Path(source))
+def light_from_text(text: str) -> PhotometricCalibration:
+    """Values written out as `gamma=2.2,mu=0`."""
+    where = f"--light {text}"
+    pairs = [[side.strip() for side in part.split("=", 1)] for part in text.split(",")]
+    if any(len(pair) != 2 for pair in pairs):
+        raise InputError(f"{where}: expected name=number pairs such as gamma=2.2,mu=0; vectors need a light.json")
+    return _light(dict(pairs), where)
+
+
+def read_light_json(path: Path) -> PhotometricCalibration:
+    """light.json -> light."""
+    return _light(read_json(path), str(path))
+
+
+def _light(data: Any, where: str) -> PhotometricCalibration:
     values = _checked(_LightFile, data, where).model_dump()
     try:
         return PhotometricCalibration(**values)
@@ -89,5 +93,5 @@ def read_light(source: str | Path) -> PhotometricCalibration:
         raise InputError(f"{where}: {error}") from error
 
 
-def write_light(light: PhotometricCalibration, path: Path) -> None:
+def write_light_json(light: PhotometricCalibration, path: Path) -> None:
     Path(path).write_text(json.dumps(asdict(light), indent=1) + "\n")

@@ -1,0 +1,101 @@
+"""Cameras in plain text: COLMAP's cameras.txt, and intrinsics.txt with a bare camera matrix.
+
+COLMAP's first pixel has its centre at (0.5, 0.5), as ours. intrinsics.txt (Hamlyn, EndoSLAM and others) comes out of
+OpenCV's calibration: there it is at (0, 0).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lightdepth.camera import CameraModel, Pinhole, Scaramuzza, camera_from_params
+from lightdepth.errors import InputError
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The file's text; `expected` ends the message when it is something else."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {expected}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file; {expected}") from error
+    if "\0" in text:
+        raise InputError(f"{path}: not a text file; {expected}")
+    return text
+
+
+def rows(text: str) -> list[list[str]]:
+    """The words of every line that is neither empty nor a comment."""
+    lines = (line.split() for line in text.lstrip("\ufeff").splitlines())
+    return [words for words in lines if words and not words[0].startswith(("#", "%"))]
+
+
+def to_numbers(words: list[str], where: str, expected: str) -> list[float]:
+    """Words as finite numbers; raises InputError with the first that is none."""
+    numbers = []
+    for word in words:
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            raise InputError(f"{where}: found {word!r}, which is not a number; expected {expected}") from None
+        if not np.isfinite(numbers[-1]):
+            raise InputError(f"{where}: {word} is not finite; expected {expected}")
+    return numbers
+
+
+def read_colmap_camera(path: Path) -> CameraModel:
+    """The camera of a cameras.txt that holds exactly one."""
+    from lightdepth.maps.colmap import read_cameras_text  # which needs this package itself, to read its sidecar
+
+    cameras = read_cameras_text(path)
+    if len(cameras) > 1:
+        raise InputError(
+            f"{path}: {len(cameras)} cameras, with ids {', '.join(map(str, cameras))}; expected exactly one: keep the "
+            "line of the camera that took these images"
+        )
+    return next(iter(cameras.values()))
+
+
+def write_colmap_camera(camera: CameraModel, path: Path) -> None:
+    """cameras.txt with the camera as id 1."""
+    if isinstance(camera, Scaramuzza):
+        raise InputError(f"{path}: COLMAP knows no SCARAMUZZA camera; convert_camera to OPENCV_FISHEYE first")
+    numbers = " ".join(repr(float(p)) for p in camera.params)
+    Path(path).write_text(
+        f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {camera.name} {camera.width} {camera.height} {numbers}\n"
+    )
+
+
+def read_intrinsics(path: Path, size: tuple[int, int] | None) -> Pinhole:
+    """A pinhole camera from its matrix, 3x3 or 4x4, row by row; `size` (width, height) is not in the file."""
+    expected = "a camera matrix fx 0 cx / 0 fy cy / 0 0 1, as 9 numbers, or 16 with a fourth row and column 0 0 0 1"
+    words = read_text(path, f"expected {expected}").translate(str.maketrans(",;[]", "    "))
+    numbers = to_numbers([w for line in rows(words) for w in line], str(path), expected)
+    if len(numbers) not in (9, 16):
+        raise InputError(f"{path}: {len(numbers)} numbers; expected {expected}")
+    side = 3 if len(numbers) == 9 else 4
+    matrix = np.array(numbers).reshape(side, side)
+    (fx, skew, cx), (zero, fy, cy) = matrix[:2, :3]
+    if not np.array_equal(matrix, _intrinsics(fx, fy, cx, cy, skew, side)) or zero:
+        hint = "; it looks transposed" if not matrix[0, 2] and matrix[2, 0] else ""
+        raise InputError(f"{path}: not a camera matrix{hint}; expected {expected}")
+    if abs(skew) > 1e-9:
+        raise InputError(f"{path}: skew {skew:g} in the first row; expected 0, no camera model here has one")
+    if size is None:
+        raise InputError(
+            f"{path}: holds no image size; give it (read_camera(path, size=(width, height))), or write a camera.json: "
+            f'{{"model": "PINHOLE", "width": W, "height": H, "params": [{fx:g}, {fy:g}, {cx:g}, {cy:g}], '
+            '"pixel_center": 0.0}'
+        )
+    camera = camera_from_params("PINHOLE", *size, [fx, fy, cx, cy], str(path)).with_pixel_center(0.0)
+    assert isinstance(camera, Pinhole)
+    return camera
+
+
+def _intrinsics(fx: float, fy: float, cx: float, cy: float, skew: float, side: int) -> np.ndarray:
+    matrix = np.eye(side)
+    matrix[:2, :3] = [[fx, skew, cx], [0, fy, cy]]
+    return matrix

@@ -1,0 +1,110 @@
+"""read_camera and read_light: the format is told by looking at the file; the writers go by its suffix."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from lightdepth.calibration.json_files import (
+    light_from_text,
+    read_camera_json,
+    read_light_json,
+    write_camera_json,
+    write_light_json,
+)
+from lightdepth.calibration.ocamcalib import is_ocamcalib, read_ocamcalib
+from lightdepth.calibration.opencv import read_opencv, write_opencv
+from lightdepth.calibration.plain_text import read_colmap_camera, read_intrinsics, read_text, rows, write_colmap_camera
+from lightdepth.calibration.vicalib import read_photometric, read_vicalib, write_photometric, write_vicalib
+from lightdepth.camera import CameraModel, Scaramuzza
+from lightdepth.errors import InputError
+from lightdepth.photometry import PhotometricCalibration
+
+CAMERA_FORMATS = (
+    "camera.json, vicalib XML (EndoMapper), OpenCV YAML, COLMAP cameras.txt, ocamcalib calib_results.txt, or "
+    "intrinsics.txt (3x3 or 4x4 numbers)"
+)
+
+
+def read_camera(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
+    """The one camera of a calibration file, in our pixel convention.
+
+    `size` (width, height) of the images is needed by intrinsics.txt alone, which does not hold it. Raises InputError,
+    naming file and field, for what cannot be read.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".json":
+        return read_camera_json(path)
+    text = read_text(path, f"expected {CAMERA_FORMATS}")
+    start = text.lstrip("\ufeff \t\r\n")
+    if start.startswith("{"):
+        return read_camera_json(path)
+    if start.startswith("<"):
+        return _plausible(read_vicalib(path), path)
+    if start.startswith("%YAML") or path.suffix.lower() in (".yaml", ".yml"):
+        return _plausible(read_opencv(path), path)
+    lines = rows(text)
+    if lines and len(lines[0]) > 2 and re.fullmatch(r"[A-Z][A-Z0-9_]+", lines[0][1]):
+        return _plausible(read_colmap_camera(path), path)
+    if is_ocamcalib(lines):
+        return _plausible(read_ocamcalib(path), path)
+    if lines and re.match(r"[-+\d.\[]", lines[0][0]):
+        return _plausible(read_intrinsics(path, size), path)
+    raise InputError(f"{path}: not a camera calibration that is known; expected {CAMERA_FORMATS}")
+
+
+def write_camera(camera: CameraModel, path: Path) -> None:
+    """To the format that the suffix stands for: .json ours, .xml vicalib, .yaml OpenCV, .txt COLMAP's cameras.txt."""
+    writers = {
+        ".json": write_camera_json,
+        ".xml": write_vicalib,
+        ".yaml": write_opencv,
+        ".yml": write_opencv,
+        ".txt": write_colmap_camera,
+    }
+    suffix = Path(path).suffix.lower()
+    if suffix not in writers:
+        raise InputError(f"{path}: no camera format ends in {suffix!r}; expected one of {', '.join(writers)}")
+    writers[suffix](camera, Path(path))
+
+
+def read_light(source: str | Path) -> PhotometricCalibration:
+    """A light.json file, an EndoMapper photometric XML, or values written out as `gamma=2.2,mu=0`."""
+    text, path = str(source), Path(source)
+    if "=" in text and not path.exists():
+        return light_from_text(text)
+    if path.suffix.lower() != ".json" and path.is_file():
+        start = read_text(path, "expected light.json or an EndoMapper photometric XML")
+        if start.lstrip("\ufeff \t\r\n").startswith("<"):
+            return read_photometric(path)
+    return read_light_json(path)
+
+
+def write_light(light: PhotometricCalibration, path: Path) -> None:
+    """To light.json, or where the name ends in .xml to EndoMapper's photometric XML."""
+    write = write_photometric if Path(path).suffix.lower() == ".xml" else write_light_json
+    write(light, Path(path))
+
+
+def _plausible(camera: CameraModel, path: Path) -> CameraModel:
+    """The camera, or InputError where width and height are swapped or the axis misses the image.
+
+    Only for calibrations of whole images: a crop may well have its axis anywhere.
+    """
+    if isinstance(camera, Scaramuzza):
+        x, y = camera.cx, camera.cy
+    else:
+        x, y = camera.params[2:4]
+    width, height = camera.width, camera.height
+
+    def off(w: int, h: int) -> float:
+        return max(abs(x / w - 0.5), abs(y / h - 0.5))
+
+    found = f"{path}: principal point ({x:.1f}, {y:.1f}) in an image {width} wide and {height} high"
+    if off(height, width) < 0.06 and off(width, height) > 0.1:
+        raise InputError(
+            f"{found}: width and height (or row and column) look swapped; the point is the middle of {height}x{width}"
+        )
+    if not (0 <= x <= width and 0 <= y <= height):
+        raise InputError(f"{found} lies outside it; is the calibration for another image size?")
+    return camera
