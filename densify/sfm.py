@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lightdepth.camera import CameraModel, KannalaBrandt, Scaramuzza
+from lightdepth.camera_conversion import Conversion, convert_camera
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
@@ -68,20 +69,6 @@ class SfmMap(SparseMap):
     unregistered: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class FisheyeFit:
-    """The Kannala-Brandt camera closest to another, and how close: pixel = camera(rotation @ ray).
-
-    The rotation (3, 3) is about the optical axis, and takes up what the other model's skew hides of it. Residuals in
-    pixels over the field of view.
-    """
-
-    camera: KannalaBrandt
-    rotation: np.ndarray
-    median_px: float
-    max_px: float
-
-
 def sparse_map_from_frames(
     frames: Sequence[Frame], out_folder: Path, config: SfmConfig | None = None, progress: Progress | None = None
 ) -> SfmMap:
@@ -118,44 +105,9 @@ def sparse_map_from_frames(
     return SfmMap(submaps, str(out_folder), unregistered)
 
 
-def fisheye_fit(camera: CameraModel, valid: np.ndarray) -> FisheyeFit:
-    """The Kannala-Brandt camera that puts the rays of `camera` closest to their pixels, in least squares.
-
-    valid (H, W): the pixels that count. Only what both models can see is fitted.
-    """
-    from scipy.optimize import least_squares
-
-    rays, seen = camera.rays()
-    rows, columns = np.nonzero(valid & seen)
-    if not len(rows):
-        raise InputError("no valid pixel in the mask: no camera can be fitted to it; is the mask inverted?")
-    step = max(1, len(rows) // 5000)
-    rows, columns = rows[::step], columns[::step]
-    rays, pixels = rays[rows, columns], np.stack([columns, rows], -1) + 0.5
-
-    def candidate(parameters: np.ndarray) -> tuple[KannalaBrandt, np.ndarray]:
-        sine, cosine = np.sin(parameters[8]), np.cos(parameters[8])
-        rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
-        return KannalaBrandt(camera.width, camera.height, *parameters[:8].tolist()), rotation
-
-    def residuals(parameters: np.ndarray) -> np.ndarray:
-        model, rotation = candidate(parameters)
-        turned = rays @ rotation.T
-        # Not `project`: a residual has to exist for every ray, also where a trial's polynomial turns over.
-        side = np.hypot(turned[:, 0], turned[:, 1])
-        theta = np.arctan2(side, turned[:, 2])
-        t2 = theta * theta
-        radius = theta * (1 + t2 * (model.k1 + t2 * (model.k2 + t2 * (model.k3 + t2 * model.k4))))
-        plane = turned[:, :2] * (radius / np.maximum(side, 1e-12))[:, None]
-        return (plane * (model.fx, model.fy) + (model.cx, model.cy) - pixels).ravel()
-
-    focal = camera.focal_length
-    axis = camera.project(np.array([0, 0, 1.0]))[0]
-    start = np.array([focal, focal, *axis, 0, 0, 0, 0, 0])
-    solved = least_squares(residuals, start, x_scale=[focal, focal, focal, focal, 0.1, 0.1, 0.1, 0.1, 0.01])
-    model, rotation = candidate(solved.x)
-    error = np.linalg.norm(solved.fun.reshape(-1, 2), axis=1)
-    fit = FisheyeFit(model, rotation, float(np.median(error)), float(error.max()))
+def fisheye_fit(camera: CameraModel, valid: np.ndarray) -> Conversion:
+    """The Kannala-Brandt camera closest to `camera` on the pixels valid (H, W), with a turn about the axis; logged."""
+    fit = convert_camera(camera, KannalaBrandt.name, valid, roll=True)
     level = logging.WARNING if fit.max_px > 2 else logging.INFO
     log.log(
         level,

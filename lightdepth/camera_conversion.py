@@ -1,0 +1,142 @@
+"""One camera model in place of another: the closest camera of a wanted model, and how close it is.
+
+For programs that know fewer lenses than we do: COLMAP has no Scaramuzza camera, vicalib's XML has no tangential
+distortion. The rays through the pixels of the first camera are the data; least squares is over pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from lightdepth.camera import CAMERA_MODELS, Brown, CameraModel, KannalaBrandt, Pinhole, Scaramuzza
+from lightdepth.errors import InputError
+
+_FITTED = 5000  # pixels, of all that count
+_PLANE_LIMIT = np.cos(np.radians(75))  # beyond this angle x/z runs away, and would be all that is fitted
+
+_Residuals = Callable[[CameraModel, np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """The closest camera of another model: pixel = camera(rotation @ ray).
+
+    The rotation (3, 3) is about the optical axis, and the identity unless a roll was allowed. Residuals in pixels, over
+    the valid pixels that both cameras can see; `seen_share` is how many of the valid pixels these are.
+    """
+
+    camera: CameraModel
+    rotation: np.ndarray
+    median_px: float
+    max_px: float
+    seen_share: float
+
+
+def convert_camera(
+    camera: CameraModel, model_name: str, valid: np.ndarray | None = None, roll: bool = False
+) -> Conversion:
+    """The camera of `model_name` that puts the rays of `camera` closest to their pixels, in least squares.
+
+    valid (H, W): the pixels that count, as a mask has them; all that the camera can see where left out. PINHOLE and
+    OPENCV are fitted up to 75 degrees from the axis. `roll` lets the new camera turn about its axis, which takes up
+    what another model's skew hides of such a turn: poses have to turn with it. Raises InputError for an unknown
+    model, and where no pixel counts.
+    """
+    from scipy.optimize import least_squares
+
+    if model_name not in CAMERA_MODELS:
+        raise InputError(f"camera model {model_name!r}; expected one of {', '.join(CAMERA_MODELS)}")
+    model = CAMERA_MODELS[model_name]
+    all_rays, seen = camera.rays()
+    counted = seen if valid is None else valid & seen
+    rows, columns = np.nonzero(counted)
+    if not len(rows):
+        raise InputError("no valid pixel in the mask: no camera can be fitted to it; is the mask inverted?")
+    rays, pixels = all_rays[rows, columns], np.stack([columns, rows], -1) + 0.5
+    fitted = np.flatnonzero(rays[:, 2] > _PLANE_LIMIT) if model in (Pinhole, Brown) else np.arange(len(rays))
+    if not len(fitted):
+        raise InputError(f"no valid pixel within 75 degrees of the axis: no {model_name} camera can be fitted")
+    fitted = fitted[:: max(1, len(fitted) // _FITTED)]
+
+    start, scale = _start(camera, model, rays[fitted], pixels[fitted])
+    count = len(start)
+    rolls = roll and model is not Scaramuzza  # whose stretch can turn by itself
+
+    def candidate(parameters: np.ndarray) -> tuple[CameraModel, np.ndarray]:
+        angle = parameters[count] if rolls else 0.0
+        sine, cosine = np.sin(angle), np.cos(angle)
+        rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
+        numbers = parameters[:count].tolist()
+        if model is Scaramuzza:
+            numbers.insert(3, 0.0)  # a1 would put the tip of a cone on the axis
+        return model(camera.width, camera.height, *numbers), rotation
+
+    residuals = _RESIDUALS[model]
+
+    def errors(parameters: np.ndarray) -> np.ndarray:
+        try:
+            trial, rotation = candidate(parameters)
+        except InputError:  # a step to where no such camera exists, as to a negative focal length: too far
+            return np.full(2 * len(fitted) if model is not Scaramuzza else 3 * len(fitted), 1e6)
+        return residuals(trial, rays[fitted] @ rotation.T, pixels[fitted]).ravel()
+
+    solved = least_squares(
+        errors, [*start, *[0.0] * rolls], x_scale=[*scale, *[0.01] * rolls], ftol=1e-12, max_nfev=100
+    )
+    found, rotation = candidate(solved.x)
+    projected, both = found.project(rays @ rotation.T)
+    if not both.any():
+        raise InputError(f"no {model_name} camera sees what this {camera.name} camera sees")
+    error = np.linalg.norm(projected - pixels, axis=1)[both]
+    return Conversion(found, rotation, float(np.median(error)), float(error.max()), float(both.mean()))
+
+
+def _start(
+    camera: CameraModel, model: type[CameraModel], rays: np.ndarray, pixels: np.ndarray
+) -> tuple[list[float], list[float]]:
+    """First parameters, with the same axis and focal length, and the size of a step in each."""
+    focal = camera.focal_length
+    x, y = camera.project(np.array([0, 0, 1.0]))[0].tolist()
+    if model is Scaramuzza:
+        rho = np.linalg.norm(pixels - (x, y), axis=1)
+        side = np.hypot(rays[:, 0], rays[:, 1])
+        off_axis = side > 1e-6
+        rho, height = rho[off_axis], rho[off_axis] * rays[off_axis, 2] / side[off_axis]
+        reach = float(rho.max(initial=1.0))
+        powers = np.array([0, 2, 3, 4])
+        shape = np.linalg.lstsq((rho[:, None] / reach) ** powers, height)[0] / reach**powers
+        return [x, y, *shape.tolist(), 1, 0, 0], [focal, focal, *(focal / reach**powers).tolist(), 0.1, 0.1, 0.1]
+    distortion = len(fields(model)) - 6
+    return [focal, focal, x, y, *[0.0] * distortion], [*[focal] * 4, *[0.1] * distortion]
+
+
+# Not `project`: a residual has to exist for every ray, also where a trial's polynomial turns over.
+
+
+def _pixel_residuals(trial: CameraModel, rays: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    if isinstance(trial, KannalaBrandt):
+        side = np.hypot(rays[:, 0], rays[:, 1])
+        radius = trial._radius(np.arctan2(side, rays[:, 2]))
+        plane = rays[:, :2] * (radius / np.maximum(side, 1e-12))[:, None]
+    else:
+        plane = rays[:, :2] / rays[:, 2:]
+        if isinstance(trial, Brown):
+            plane = trial._distort(plane)
+    assert isinstance(trial, Pinhole | Brown | KannalaBrandt)
+    return trial._to_pixels(plane) - pixels
+
+
+def _ray_residuals(trial: CameraModel, rays: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """In ray space, where Scaramuzza's model is a formula, scaled to pixels at the axis."""
+    return (trial.unproject(pixels)[0] - rays) * trial.focal_length
+
+
+_RESIDUALS: dict[type[CameraModel], _Residuals] = {
+    Pinhole: _pixel_residuals,
+    Brown: _pixel_residuals,
+    KannalaBrandt: _pixel_residuals,
+    Scaramuzza: _ray_residuals,
+}
