@@ -10,7 +10,7 @@ from typing import Literal
 
 from lightdepth.calibration import read_light
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
-from lightdepth.datasets import open_sequence, write_c3vd, write_folder
+from lightdepth.datasets import open_sequence, write_c3vd, write_endomapper, write_folder
 from lightdepth.errors import InputError
 from lightdepth.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.frame import Frame
@@ -25,7 +25,7 @@ from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
 
 def synth(
     output: Path,
-    layout: Literal["frames", "c3vd"] = "frames",
+    layout: Literal["frames", "c3vd", "endomapper"] = "frames",
     lens: str = "c3vd",
     frames: int = 40,
     size: tuple[int, int] = (320, 256),
@@ -41,7 +41,7 @@ def synth(
 
     Args:
         output: folder to make
-        layout: frames (our own folder) or c3vd
+        layout: frames (our own folder), c3vd or endomapper (out1.png, ... and XML; its truth is in truth/sequence)
         lens: pinhole, fisheye or c3vd
         frames: number of frames
         size: width and height of the images, pixels
@@ -59,13 +59,18 @@ def synth(
     slam = slam if spurious is None else replace(slam, spurious=spurious)
     if not 0 <= slam.spurious < 1:
         raise InputError(f"--spurious {slam.spurious}; expected a share of at least 0 and below 1")
+    if layout == "endomapper" and lens == "c3vd":
+        raise InputError("--layout endomapper holds no Scaramuzza lens, as C3VD's is; add --lens fisheye")
     chosen = read_light(light) if light is not None else None
     with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", frames) as bar:
         sequence = render_sequence(
             seed, frames, tube_lens(lens, *size), travel_mm, scene, chosen, lambda *_: bar.advance()
         )
-        export = simulate_slam(sequence.frames, slam, seed)
-        write_synthetic(sequence.frames, export, run.folder, layout)
+        made = sequence.frames
+        if layout == "endomapper":  # which counts frames from 1
+            made = [replace(frame, name=f"out{frame.number + 1}") for frame in made]
+        export = simulate_slam(made, slam, seed)
+        write_synthetic(made, export, run.folder, layout)
         run.log(f"{frames} frames, {len(export.map.submaps)} submaps in {output}")
 
 
@@ -74,6 +79,9 @@ def write_synthetic(frames: Sequence[Frame], export: SimulatedSlam, folder: Path
     truth/slam.json."""
     if layout == "c3vd":
         write_c3vd(frames, folder / "sequence")
+    elif layout == "endomapper":
+        write_endomapper(frames, folder / "sequence")
+        write_folder(frames, folder / "truth" / "sequence")
     else:
         write_folder(frames, folder)
     write_multimap(export.map, folder / "slam")
@@ -105,9 +113,9 @@ def predict(
         data: folder of frames
         output: folder to make
         checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
-        format: folder or c3vd; found by looking when left out
-        camera: camera.json that wins over the folder's
-        light: light.json, or gamma=2.2,mu=0, that wins over the folder's
+        format: folder, c3vd or endomapper; found by looking when left out
+        camera: calibration file that wins over the folder's
+        light: light.json, photometric XML, or gamma=2.2,mu=0, that wins over the folder's
         mask: image, white where tissue shows
         previews: also write a PNG with image and distance for every frame
         overwrite: replace a folder made before

@@ -1,8 +1,19 @@
 """What is on disk, as frames: open_sequence(path) -> Sequence[Frame]. One module per format, each with its writer."""
 
 from lightdepth.datasets.c3vd import read_c3vd, write_c3vd
+from lightdepth.datasets.endomapper import read_endomapper, write_endomapper
 from lightdepth.datasets.folder import read_folder, write_folder
 from lightdepth.datasets.reading import FORMATS, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
 
-__all__ = ["FORMATS", "FrameSequence", "open_sequence", "read_c3vd", "read_folder", "write_c3vd", "write_folder"]
+__all__ = [
+    "FORMATS",
+    "FrameSequence",
+    "open_sequence",
+    "read_c3vd",
+    "read_endomapper",
+    "read_folder",
+    "write_c3vd",
+    "write_endomapper",
+    "write_folder",
+]

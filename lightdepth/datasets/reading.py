@@ -7,12 +7,13 @@ from pathlib import Path
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.c3vd import is_c3vd, read_c3vd
+from lightdepth.datasets.endomapper import image_folder, is_endomapper, read_endomapper
 from lightdepth.datasets.folder import read_folder
 from lightdepth.datasets.sequence import FrameSequence, list_images, read_image, read_mask
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 
-FORMATS = ("folder", "c3vd")
+FORMATS = ("folder", "c3vd", "endomapper")
 
 
 def open_sequence(
@@ -26,32 +27,57 @@ def open_sequence(
     """Frames at `path`, of a format found by looking or named; lazy.
 
     `camera`, `light`, `mask` are files (light also `gamma=2.2,mu=0`) that win over what is in the folder;
-    `map_camera` serves where neither a file nor the format gives a camera.
+    `map_camera` serves where neither a file nor the format gives a camera, and wins over EndoMapper's calibration:
+    its own maps were made with other numbers.
     """
     path = Path(path)
     if not path.is_dir():
         found = "is a file" if path.is_file() else "does not exist"
         raise InputError(f"{path}: {found}; expected a folder of frames")
     if format is None:
-        format = "c3vd" if is_c3vd(path) else "folder"
+        format = "c3vd" if is_c3vd(path) else "endomapper" if is_endomapper(path) else "folder"
     chosen_light = read_light(light) if light is not None else None
     chosen_mask = read_mask(Path(mask)) if mask is not None else None
-    chosen = read_camera(Path(camera)) if camera is not None else None
+    chosen = _read_camera(Path(camera), _image_folder(path, format)) if camera is not None else None
     if format == "c3vd":
         return read_c3vd(path, chosen, chosen_light, chosen_mask)
+    if format == "endomapper":
+        if chosen is None and map_camera is not None:
+            chosen = _at_size_of_images(map_camera, _image_folder(path, format))
+        return read_endomapper(path, chosen, chosen_light, chosen_mask)
     if format == "folder":
         if chosen is None and map_camera is not None and not (path / "camera.json").is_file():
-            chosen = _at_size_of_images(map_camera, path)
+            chosen = _at_size_of_images(map_camera, _image_folder(path, format))
         return read_folder(path, chosen, chosen_light, chosen_mask)
     raise InputError(f"format {format!r}; expected one of {', '.join(FORMATS)}")
 
 
-def _at_size_of_images(camera: CameraModel, path: Path) -> CameraModel:
+def _image_folder(path: Path, format: str) -> Path:
+    if format == "endomapper":
+        return image_folder(path)
+    return path / "frames" if (path / "frames").is_dir() else path
+
+
+def _read_camera(file: Path, folder: Path) -> CameraModel:
+    """The camera of a file; intrinsics.txt, which holds no size, is for the images in the folder."""
+    return read_camera(file, _size_of_images(folder) if file.suffix.lower() == ".txt" else None)
+
+
+def _at_size_of_images(camera: CameraModel, folder: Path) -> CameraModel:
     """A map's camera at the size of the images: a SLAM often works at half size. Cropped images are refused."""
-    images = list_images(path / "frames" if (path / "frames").is_dir() else path)
-    if not images:
+    size = _size_of_images(folder)
+    if size is None:
         return camera
-    height, width = read_image(images[0]).shape[:2]
+    width, height = size
     if abs(width / camera.width / (height / camera.height) - 1) > 0.01:
-        check_image_size(images[0].name, width, height, camera)
+        check_image_size(str(folder), width, height, camera)
     return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
+
+
+def _size_of_images(folder: Path) -> tuple[int, int] | None:
+    """Width and height of the first image, where there is one."""
+    images = list_images(folder)
+    if not images:
+        return None
+    height, width = read_image(images[0]).shape[:2]
+    return width, height

@@ -1,0 +1,153 @@
+"""EndoMapper: extracted frames `out<N>.png`, with the calibration of the endoscope by number (FORMATS: EndoMapper).
+
+The frames lie in img_train/, images/, frames/ or the folder itself; N counts from 1, so that video frame 0 is out1.
+`Endoscope_XX_geometrical.xml` and `Endoscope_XX_photometrical.xml` are looked for beside the frames, and then in
+Calibrations/ (in a folder for each endoscope, or without) here and in the folders above. Where there is more than one
+endoscope, `Seq_NNN_info.json` says which it was. Calibrations are for 1440x1080, and are resized to smaller frames of
+that shape. mask.png, in the folder or beside the frames, is white where tissue shows; without one the black border is
+found.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lightdepth.calibration import read_camera, read_json, read_light, write_camera, write_light
+from lightdepth.camera import CameraModel
+from lightdepth.datasets.folder import to_bgr8
+from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_image, read_mask
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame, check_image_size, frame_number
+from lightdepth.photometry import PhotometricCalibration
+
+_LEVELS = 6  # folders above the frames in which calibrations are looked for
+_GEOMETRY, _PHOTOMETRY = "geometrical", "photometrical"
+
+
+def is_endomapper(path: Path) -> bool:
+    """Whether a folder has EndoMapper's frames, or an endoscope's calibration beside images."""
+    if (path / "camera.json").is_file():
+        return False
+    named = any(re.fullmatch(r"out\d+", image.stem) for image in list_images(image_folder(path)))
+    return named or any(path.glob(f"Endoscope_*_{_GEOMETRY}.xml"))
+
+
+def image_folder(path: Path) -> Path:
+    """Where the frames of a sequence lie."""
+    return next((path / name for name in ("img_train", "images", "frames") if (path / name).is_dir()), path)
+
+
+def read_endomapper(
+    path: Path,
+    camera: CameraModel | None = None,
+    light: PhotometricCalibration | None = None,
+    mask: np.ndarray | None = None,
+    fps: float | None = None,
+) -> FrameSequence:
+    """Frames of extracted video. What is given here wins over the files; time is (N - 1) / fps where `fps` is given
+    (40 or 50 in the data set). Raises InputError where no camera is found."""
+    images = list_images(image_folder(path))
+    if not images:
+        raise InputError(f"{image_folder(path)}: no images with a number in their names; expected out1.png, out2.png")
+    if frame_number(images[0].name) < 1:
+        raise InputError(
+            f"{images[0]}: number 0, but EndoMapper counts frames from 1 (out1.png is the first of the video); "
+            "extract them so, or read them with --format folder"
+        )
+    height, width = read_image(images[0]).shape[:2]
+    if camera is None:
+        file = _calibration(path, _GEOMETRY)
+        if file is None:
+            raise InputError(
+                f"{path}: no Endoscope_XX_{_GEOMETRY}.xml here, nor in Calibrations/ here or above; put it beside the "
+                "frames, or give --camera FILE"
+            )
+        camera = _at_size(read_camera(file), width, height, images[0].name)
+    if light is None:
+        file = _calibration(path, _PHOTOMETRY)
+        light = PhotometricCalibration() if file is None else read_light(file)
+    if mask is None:
+        found = [f for f in (path / "mask.png", image_folder(path) / "mask.png") if f.is_file()]
+        chosen = images[:: max(1, len(images) // 8)][:8]
+        mask = read_mask(found[0]) if found else border_mask([read_image(image) for image in chosen])
+        if mask.shape != (height, width) and abs(mask.shape[1] / mask.shape[0] / (width / height) - 1) < 0.01:
+            mask = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+    def load(i: int) -> Frame:
+        number = frame_number(images[i].name)
+        time = None if fps is None else (number - 1) / fps
+        return Frame(images[i].stem, read_image(images[i]), camera, light, mask, time=time)
+
+    return FrameSequence([image.stem for image in images], load, str(path))
+
+
+def write_endomapper(frames: Sequence[Frame], path: Path, endoscope: str = "00") -> None:
+    """img_train/out<N>.png by the frames' numbers, which count from 1, the two XML files and mask.png. Truth, gain and
+    reflectance have no place in it."""
+    if not len(frames):
+        raise InputError(f"{path}: no frames to write")
+    early = [frame.name for frame in frames if frame.number < 1]
+    if early:
+        raise InputError(f"{path}: frame {early[0]} has number {frame_number(early[0])}; EndoMapper counts from 1")
+    (path / "img_train").mkdir(parents=True)
+    write_camera(frames[0].camera, path / f"Endoscope_{endoscope}_{_GEOMETRY}.xml")
+    write_light(frames[0].light, path / f"Endoscope_{endoscope}_{_PHOTOMETRY}.xml")
+    if frames[0].mask is not None:
+        cv2.imwrite(str(path / "mask.png"), frames[0].mask.astype(np.uint8) * 255)
+    for frame in frames:
+        cv2.imwrite(str(path / "img_train" / f"out{frame.number}.png"), to_bgr8(frame.image))
+
+
+def _at_size(camera: CameraModel, width: int, height: int, name: str) -> CameraModel:
+    """The calibration at the size of the frames; cropped frames are refused."""
+    if abs(width / camera.width / (height / camera.height) - 1) > 0.01:
+        check_image_size(name, width, height, camera)
+    return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
+
+
+def _calibration(path: Path, kind: str) -> Path | None:
+    """The calibration of this kind closest to the frames; of several, the one of the sequence's endoscope."""
+    for folder in _upwards(path):
+        patterns = ("", "Calibrations/", "Calibrations/Endoscope_*/")
+        found = {f.name: f for pattern in patterns for f in sorted(folder.glob(f"{pattern}Endoscope_*_{kind}.xml"))}
+        if not found:
+            continue
+        number = _endoscope(path)
+        if number is None and len(found) == 1:
+            return next(iter(found.values()))
+        if number is None:
+            raise InputError(
+                f"{folder}: {len(found)} calibrations ({', '.join(found)}) and no Seq_NNN_info.json that says which "
+                "endoscope it was; put the right one beside the frames, or give --camera and --light"
+            )
+        for name, file in found.items():
+            label = name.removeprefix("Endoscope_").removesuffix(f"_{kind}.xml")
+            if label == number or (label.isdigit() and number.isdigit() and int(label) == int(number)):
+                return file
+        raise InputError(
+            f"{folder}: {', '.join(found)}, but the sequence was made with endoscope {number}; give its calibration "
+            "with --camera and --light"
+        )
+    return None
+
+
+def _endoscope(path: Path) -> str | None:
+    """The endoscope's number in the sequence's info file; None where there is no such file."""
+    for folder in _upwards(path):
+        for file in sorted(folder.glob("Seq_*_info.json")):
+            data = read_json(file)
+            number = data.get("endoscope_number") if isinstance(data, dict) else None
+            if number is None:
+                raise InputError(f"{file}: endoscope_number missing; expected the number of the endoscope, or N/A")
+            return str(number)
+    return None
+
+
+def _upwards(path: Path) -> list[Path]:
+    path = path.resolve()
+    return [path, *list(path.parents)[: _LEVELS - 1]]
