@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 GROUP = "lightdepth.commands"
-ORDER = ("demo", "doctor", "synth", "train", "predict", "sparse", "densify", "evaluate")
+ORDER = ("demo", "doctor", "synth", "calibrate-light", "train", "predict", "sparse", "densify", "evaluate")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -72,7 +72,7 @@ def _parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
             type=Path | None,
             required=needed,
             default=None if needed else default,
-            help="folder to make",
+            help="file to write" if verb == "calibrate-light" else "folder to make",
         )
     if "overwrite" in parameters:
         parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run made there")
@@ -97,7 +97,7 @@ def _sorted(commands: dict[str, metadata.EntryPoint]) -> list[str]:
 def _help(commands: dict[str, metadata.EntryPoint]) -> str:
     lines = ["usage: lightdepth VERB [options]     (lightdepth VERB --help shows a verb's options)", ""]
     for name in _sorted(commands):
-        lines.append(f"  {name:<10} {_summary(commands[name])}")
+        lines.append(f"  {name:<15} {_summary(commands[name])}")
     return "\n".join([*lines, "", "lightdepth --version prints the version."])
 
 

@@ -1,20 +1,26 @@
-"""The verbs of lightdepth: synth and predict. Thin: arguments in, files out."""
+"""The verbs of lightdepth: synth, calibrate-light and predict. Thin: arguments in, files out."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from lightdepth.calibration import read_light
+import numpy as np
+
+from lightdepth.calibration import read_light, write_light
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import open_sequence, write_c3vd, write_endomapper, write_folder
 from lightdepth.errors import InputError
 from lightdepth.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.frame import Frame
-from lightdepth.maps import write_multimap
+from lightdepth.light_fit import fit_on_map
+from lightdepth.light_page import light_page
+from lightdepth.light_truth import fit_on_truth
+from lightdepth.maps import read_map, write_multimap
 from lightdepth.progress import Progress
 from lightdepth.run import plain, run_folder
 from lightdepth.tube import lens as tube_lens
@@ -94,6 +100,51 @@ def write_synthetic(frames: Sequence[Frame], export: SimulatedSlam, folder: Path
     }
     (folder / "truth").mkdir(exist_ok=True)
     (folder / "truth" / "slam.json").write_text(json.dumps(plain(known)) + "\n")
+
+
+def calibrate_light(
+    data: Path,
+    output: Path,
+    map: Path | None = None,
+    format: str | None = None,
+    camera: Path | None = None,
+    mask: Path | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> None:
+    """The light of an endoscope: response and spread, from a sparse map or from frames with known depth.
+
+    Args:
+        data: folder of frames
+        output: light.json to write, with a report beside it (light.html)
+        map: COLMAP model(s) or a multi-map tree; left out, the frames' own true depth is needed
+        format: folder or c3vd; found by looking when left out
+        camera: camera.json; left out, the map's own camera, else the folder's
+        mask: image, white where tissue shows
+        seed: draws the bootstrap
+        overwrite: replace files made before
+    """
+    page_path = output.with_suffix(".html")
+    if output.is_dir() or output.suffix == ".html":
+        raise InputError(f"-o {output}: expected the name of a file to write, such as light.json")
+    made = [path for path in (output, page_path) if path.exists()]
+    if made and not overwrite:
+        raise InputError(f"{made[0]}: already there; choose another -o, or give --overwrite")
+    rng = np.random.default_rng(seed)
+    if map is None:
+        fit = fit_on_truth(open_sequence(data, format, camera, None, mask), rng)
+        what = f"{data}, frames with known depth"
+    else:
+        sparse_map = read_map(map)
+        frames = open_sequence(data, format, camera, None, mask, sparse_map.submaps[0].keyframes[0].camera)
+        fit = fit_on_map(frames, sparse_map, camera=frames[0].camera if camera is not None else None, rng=rng)
+        what = f"{data}, {sparse_map.source}"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    partial = output.with_name(f".{output.name}.partial")
+    for path, write in ((page_path, light_page(fit, what).write), (output, lambda p: write_light(fit.light, p))):
+        write(partial)
+        os.replace(partial, path)
+    print(f"light: {fit.summary()}\n{output}, {page_path}")
 
 
 def predict(
