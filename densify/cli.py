@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -21,7 +22,9 @@ from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.commands import write_synthetic
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
+from lightdepth.light_fit import fit_on_map, with_light
 from lightdepth.maps import read_map
+from lightdepth.photometry import PhotometricCalibration
 from lightdepth.predict import DepthModel
 from lightdepth.progress import Progress
 from lightdepth.report import number
@@ -49,6 +52,7 @@ def densify(
     sfm: SfmConfig = SfmConfig(),
     formats: tuple[str, ...] = ("ply",),
     mm_per_unit: float | None = None,
+    fit_light: bool = True,
     overwrite: bool = False,
 ) -> None:
     """Dense surfaces from frames and a sparse map, one per submap.
@@ -70,6 +74,7 @@ def densify(
         sfm: how frames are mapped when there is no map
         formats: of the mesh: ply, glb, obj
         mm_per_unit: millimetres per map unit, where known; lengths are then written in mm
+        fit_light: where nobody gave the light, fit it on the map and use it if withheld keyframes agree
         overwrite: replace a run made before
     """
     arguments = {k: v for k, v in locals().items() if k != "overwrite"}
@@ -84,9 +89,12 @@ def densify(
         sparse_map, frames = _map_and_frames(run, data, map, format, camera, light, mask, sfm)
         for name, path in (("data", data), ("map", map), ("camera", camera), ("mask", mask)):
             run.hash_input(name, path)
+        if fit_light and light is None and checkpoint != "constant":
+            frames = _fitted_light(run, frames, sparse_map, model)
         work = Densified.make(frames, sparse_map, model, config)
         work.write(run, formats, mm_per_unit)
         notes = [f"{data}, {sparse_map.source}; depth by {work.model}; light of the frames: {_light(frames)}."]
+        notes += [f"Light {run.record['light_fit']['summary']}."] if "light_fit" in run.record else []
         page = densify_page("Densified maps", work.results, work.baselines, work.gallery, notes)
         page.write(run.folder / "report.html")
         run.log(f"{output}/report.html")
@@ -333,6 +341,30 @@ def _sparse(run: Run, frames: FrameSequence, config: SfmConfig) -> SparseMap:
         )
     run.record["unregistered"] = list(found.unregistered)
     return found
+
+
+def _fitted_light(run: Run, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel) -> FrameSequence:
+    """The frames under the light that the map tells, where theirs is only assumed and the model does better with it."""
+    if frames[0].light != PhotometricCalibration():
+        return frames
+    start = time.perf_counter()
+    try:
+        fit = fit_on_map(frames, sparse_map, model)
+    except InputError as error:
+        run.log(f"light assumed, not fitted: {error}")
+        return frames
+    run.record["light_fit"] = plain(
+        {
+            "summary": f"fitted on the map: {fit.summary()}",
+            "fitted": fit.fitted,
+            "uncertainty": fit.uncertainty,
+            "errors": fit.errors,
+            "used": fit.better,
+            "seconds": round(time.perf_counter() - start, 3),
+        }
+    )
+    run.log(f"light {run.record['light_fit']['summary']}")
+    return with_light(frames, fit.light) if fit.better else frames
 
 
 def _median(values: Any) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -174,6 +176,32 @@ def test_the_verb_writes_a_light_that_can_be_read_and_a_report_with_nothing_left
     assert "slope" not in page.split("<img")[0] and page.count("<img") == 2 and "standard deviation" in page
     assert main(argv) == 3 and "already there" in capsys.readouterr().err
     assert main([*argv, "--overwrite"]) == 0
+
+
+@pytest.mark.parametrize("fit_light", [True, False])
+def test_densify_fits_the_light_that_nobody_gave_unless_told_not_to(data, tmp_path, fit_light, capsys):
+    argv = ["densify", str(data), "--map", str(data / "slam"), "--checkpoint", "decline", "--withhold", "0"]
+    assert main([*argv, "--fit-light", str(fit_light).lower(), "-o", str(tmp_path / "run")]) == 0
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    said = "light fitted on the map: gamma" in capsys.readouterr().out
+    assert said is fit_light is ("light_fit" in record)
+    if fit_light:
+        fit = record["light_fit"]
+        assert fit["used"] == (fit["errors"]["fitted"] < fit["errors"]["default"]) and fit["seconds"] < 60
+        assert "Light fitted on the map" in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("given", ["option", "file"])
+def test_densify_keeps_a_light_that_somebody_gave(data, tmp_path, given):
+    folder = tmp_path / "seq"
+    shutil.copytree(data, folder)
+    argv = ["densify", str(folder), "--map", str(folder / "slam"), "--checkpoint", "decline", "--withhold", "0"]
+    if given == "file":
+        (folder / "light.json").write_text('{"gamma": 2.0, "mu": 1.0}')
+    else:
+        argv += ["--light", "gamma=2.2,mu=2.767"]
+    assert main([*argv, "-o", str(tmp_path / "run")]) == 0
+    assert "light_fit" not in json.loads((tmp_path / "run" / "run.json").read_text())
 
 
 def test_the_verb_refuses_a_folder_as_its_file(data, tmp_path, capsys):
