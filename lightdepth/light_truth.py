@@ -31,7 +31,7 @@ V_RANGE = (0.05, 0.75)  # darker is noise, brighter is where tone curves bend
 BLUR = 0.008  # of the image height: enough against noise, too little to mix a fold with what lies behind it
 EXPONENTS = (0.05, 1.6)
 GAIN_NEEDED = 0.95  # a freer model must leave at most this share of the withheld residual,
-RESOLUTION = 0.001  # and this much less: below the step of an 8-bit image nothing can be told apart
+RESOLUTION = 0.0002  # and this much less: below it lies rounding, not light
 
 
 @dataclass(frozen=True)
