@@ -16,15 +16,29 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lightdepth.camera import CameraModel
+from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.datasets.folder import to_bgr8
 from lightdepth.datasets.sequence import FrameSequence, border_mask, read_image, read_raw
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.sparse_map import check_rigid
-from lightdepth.tube.path import C3VD
 
+C3VD = Scaramuzza(
+    1350,
+    1080,
+    678.544839263292,
+    542.975887548343,
+    769.243600037458,
+    0.0,
+    -8.12770624150226e-4,
+    6.25674244578925e-7,
+    -1.19662182144280e-9,
+    0.999986882249990,
+    0.00288273829525059,
+    -0.00296316513429569,
+).with_pixel_center(0.0)
+"""The camera of C3VD, first edition (as its authors' loader has it), at full size."""
 FULL_SCALE_MM = 100.0
 LIGHT = PhotometricCalibration(gamma=2.2, mu=2.767, source="published")
 

@@ -6,25 +6,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole, Scaramuzza
+from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole
+from lightdepth.datasets.c3vd import C3VD
 from lightdepth.errors import InputError
 from lightdepth.tube.shape import TubeShape
-
-C3VD = Scaramuzza(
-    1350,
-    1080,
-    678.544839263292,
-    542.975887548343,
-    769.243600037458,
-    0.0,
-    -8.12770624150226e-4,
-    6.25674244578925e-7,
-    -1.19662182144280e-9,
-    0.999986882249990,
-    0.00288273829525059,
-    -0.00296316513429569,
-).with_pixel_center(0.0)
-"""The camera of C3VD, first edition (as its authors' loader has it), at full size."""
 
 
 def lens(kind: str, width: int, height: int) -> CameraModel:
