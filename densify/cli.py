@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -379,4 +378,4 @@ def _share(value: float) -> str:
 
 def _light(frames: FrameSequence) -> str:
     light = frames[0].light
-    return json.dumps({"gamma": light.gamma, "mu": light.mu, "source": light.source})
+    return f"gamma {light.gamma:.3g}, mu {light.mu:.3g} ({light.source})"
