@@ -1,16 +1,22 @@
-"""C3VD, first edition: N_color.png, NNNN_depth.tiff, pose.txt (FORMATS: depth is along the axis, mm = v / 65535 * 100).
+"""C3VD, its three editions (FORMATS: depth is along the axis, mm = v / 65535 * 100; 16 bits, TIFF).
 
-Colour files are numbered `0_color.png` or `0000_color.png`, depth always `0000_depth.tiff`: they are paired by integer.
-Depth 0 (no data) and 65535 (clipped at 100 mm) are both unknown. Poses are camera-to-world [mm], 16 numbers a line,
-column by column in the present release and row by row in the oldest: each line shows which. Screenings have no depth.
-The lens is the authors' Scaramuzza model; the light was never calibrated, EndoMapper's values are used (same
-endoscope).
+| tree | colour | depth | camera |
+|---|---|---|---|
+| first edition | `N_color.png` or `NNNN_color.png` | `NNNN_depth.tiff` | C3VD |
+| first edition, sorted into folders (EndoGSLAM) | the same in `color/` | the same in `depth/` | C3VD |
+| second and third (C3VDv2, C3VDv3) | `rgb/NNNN.png` | `depth/NNNN_depth.tiff` | C3VD_V2 |
+
+Colour and depth are paired by integer. Depth 0 (no data) and 65535 (clipped at 100 mm) are both unknown. Poses
+(`pose.txt`) are camera-to-world [mm], 16 numbers a line, column by column in the present release and row by row in the
+oldest: each line shows which. Screenings and deformations have no depth. The lenses are the authors' Scaramuzza models;
+the light was never calibrated, EndoMapper's values are used (same endoscope).
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,7 +24,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import FrameSequence, border_mask, read_image, read_raw
+from lightdepth.datasets.sequence import FrameSequence, along_ray, border_mask, numbered_files, read_code, read_image
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
@@ -39,13 +45,51 @@ C3VD = Scaramuzza(
     -0.00296316513429569,
 ).with_pixel_center(0.0)
 """The camera of C3VD, first edition (as its authors' loader has it), at full size."""
+C3VD_V2 = Scaramuzza(
+    1350,
+    1080,
+    677.739464094188,
+    543.057997844875,
+    767.733695862103,
+    0.0,
+    -5.92506426558248e-4,
+    -2.69440266600040e-7,
+    -2.16380341010063e-10,
+    1.0,
+    0.0,
+    0.0,
+).with_pixel_center(0.0)
+"""The camera of C3VD, second and third edition (as the third's tools have it), at full size."""
 FULL_SCALE_MM = 100.0
 LIGHT = PhotometricCalibration(gamma=2.2, mu=2.767, source="published")
 
 
+@dataclass(frozen=True)
+class _Tree:
+    """Where an edition keeps its files, how it names its colour files and which camera took them."""
+
+    colour: str
+    depth: str
+    suffix: str
+    camera: Scaramuzza
+
+
+_TREES = {
+    "v1": _Tree(".", ".", "_color.png", C3VD),
+    "v1 sorted": _Tree("color", "depth", "_color.png", C3VD),
+    "v2": _Tree("rgb", "depth", ".png", C3VD_V2),
+}
+
+
 def is_c3vd(path: Path) -> bool:
-    """Whether a folder has C3VD's colour files."""
-    return any(path.glob("*_color.png"))
+    """Whether a folder has C3VD's colour files; images in rgb/ need C3VD's depth or poses beside them."""
+    return _tree(path) is not None
+
+
+def image_folder(path: Path) -> Path:
+    """Where the colour images of a sequence lie."""
+    tree = _tree(path)
+    return path if tree is None else path / tree.colour
 
 
 def read_c3vd(
@@ -55,34 +99,42 @@ def read_c3vd(
     mask: np.ndarray | None = None,
 ) -> FrameSequence:
     """Frames of a C3VD sequence, with distance and pose where the folder has them."""
-    colour = _numbered(path, "color.png")
-    depth = _numbered(path, "depth.tiff")
+    tree = _tree(path)
+    if tree is None:
+        raise InputError(
+            f"{path}: no *_color.png in it or in color/, and no rgb/NNNN.png beside depth/ or pose.txt; "
+            "is it a C3VD sequence?"
+        )
+    colour = _colour(path, tree)
+    depth = numbered_files(path / tree.depth, r"(\d+)_depth\.tiff")
     numbers = sorted(colour)
-    if not numbers:
-        raise InputError(f"{path}: no *_color.png in it; is it a C3VD sequence?")
     poses = _read_poses(path / "pose.txt") if (path / "pose.txt").is_file() else None
     if poses is not None and numbers[-1] >= len(poses):
         raise InputError(f"{path / 'pose.txt'}: {len(poses)} poses, but there is a frame {numbers[-1]}")
     if camera is None:
         height, width = read_image(colour[numbers[0]]).shape[:2]
-        if abs(width / height / (C3VD.width / C3VD.height) - 1) > 0.01:
+        whole = tree.camera
+        if abs(width / height / (whole.width / whole.height) - 1) > 0.01:
             raise InputError(
-                f"{path}: images are {width}x{height}; C3VD's camera is for {C3VD.width}x{C3VD.height} and its "
+                f"{path}: images are {width}x{height}; C3VD's camera is for {whole.width}x{whole.height} and its "
                 "reductions. Give the camera of cropped images with --camera FILE"
             )
-        camera = C3VD.resized(width, height)
+        camera = whole.resized(width, height)
     if mask is None:
         chosen = numbers[:: max(1, len(numbers) // 8)][:8]
         mask = border_mask([read_image(colour[n]) for n in chosen])
     ray_z = camera.rays()[0][..., 2]
+    names = [f"{n:04d}{tree.suffix.removesuffix('.png')}" for n in numbers]
 
     def load(i: int) -> Frame:
         number = numbers[i]
         distance = None
         if number in depth:
-            distance = _distance(read_raw(depth[number]), ray_z, depth[number])
+            code = read_code(depth[number], ray_z, "C3VD")
+            known = (code > 0) & (code < 65535)
+            distance = along_ray(code.astype(np.float32) / 65535 * FULL_SCALE_MM, known, ray_z)
         return Frame(
-            f"{number:04d}_color",
+            names[i],
             read_image(colour[number]),
             camera,
             light or LIGHT,
@@ -92,48 +144,38 @@ def read_c3vd(
             true_world_from_cam=None if poses is None else poses[number],
         )
 
-    return FrameSequence([f"{n:04d}_color" for n in numbers], load, str(path))
+    return FrameSequence(names, load, str(path))
 
 
-def write_c3vd(frames: Sequence[Frame], path: Path) -> None:
-    """A C3VD tree from frames with truth (depth beyond 100 mm is clipped, as in the data set)."""
-    path.mkdir(parents=True)
+def write_c3vd(frames: Sequence[Frame], path: Path, tree: str = "v1") -> None:
+    """A C3VD tree ("v1", "v1 sorted" or "v2") from frames with truth (depth beyond 100 mm is clipped, as in the data
+    set). The camera is not in the tree: the frames must have been taken with the edition's own."""
+    where = _TREES[tree]
+    for folder in {where.colour, where.depth}:
+        (path / folder).mkdir(parents=True)
     lines = []
     for frame in frames:
         stem = f"{frame.number:04d}"
-        cv2.imwrite(str(path / f"{stem}_color.png"), to_bgr8(frame.image))
+        cv2.imwrite(str(path / where.colour / f"{stem}{where.suffix}"), to_bgr8(frame.image))
         if frame.true_distance is not None:
             depth = frame.true_distance * frame.camera.rays()[0][..., 2]
             code = np.floor(65535 * np.clip(depth / FULL_SCALE_MM, 0, 1))
-            cv2.imwrite(str(path / f"{stem}_depth.tiff"), code.astype(np.uint16))
+            cv2.imwrite(str(path / where.depth / f"{stem}_depth.tiff"), code.astype(np.uint16))
         if frame.true_world_from_cam is not None:
             lines.append(",".join(f"{v:.9g}" for v in frame.true_world_from_cam.T.ravel()))
     if lines:
         (path / "pose.txt").write_text("\n".join(lines) + "\n")
 
 
-def _numbered(path: Path, suffix: str) -> dict[int, Path]:
-    found: dict[int, Path] = {}
-    for file in sorted(path.glob(f"*_{suffix}")):
-        match = re.fullmatch(rf"(\d+)_{re.escape(suffix)}", file.name)
-        if match:
-            number = int(match[1])
-            if number in found:
-                raise InputError(f"{path}: {found[number].name} and {file.name} have the same number")
-            found[number] = file
-    return found
+def _tree(path: Path) -> _Tree | None:
+    """The edition at a path, told by its colour files; None where there is none."""
+    beside = (path / "pose.txt").is_file() or any(path.glob("depth/*_depth.tiff"))
+    trees = [_TREES["v1"], _TREES["v1 sorted"], *([_TREES["v2"]] if beside else [])]
+    return next((tree for tree in trees if _colour(path, tree)), None)
 
 
-def _distance(code: np.ndarray, ray_z: np.ndarray, path: Path) -> np.ndarray:
-    if code.dtype != np.uint16 or code.ndim != 2:
-        raise InputError(f"{path}: {code.dtype} of shape {code.shape}; C3VD's depth is one channel of 16 bits")
-    if code.shape != ray_z.shape:
-        raise InputError(
-            f"{path}: depth is {code.shape[1]}x{code.shape[0]}, the image {ray_z.shape[1]}x{ray_z.shape[0]}"
-        )
-    known = (code > 0) & (code < 65535) & (ray_z > 0.05)
-    depth = code.astype(np.float32) / 65535 * FULL_SCALE_MM
-    return np.where(known, depth / np.where(known, ray_z, 1), 0).astype(np.float32)
+def _colour(path: Path, tree: _Tree) -> dict[int, Path]:
+    return numbered_files(path / tree.colour, rf"(\d+){re.escape(tree.suffix)}")
 
 
 def _read_poses(path: Path) -> np.ndarray:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
+from lightdepth.datasets import c3vd, endomapper
 from lightdepth.datasets.c3vd import is_c3vd, read_c3vd
-from lightdepth.datasets.endomapper import image_folder, is_endomapper, read_endomapper
+from lightdepth.datasets.endomapper import is_endomapper, read_endomapper
 from lightdepth.datasets.folder import read_folder
 from lightdepth.datasets.sequence import FrameSequence, list_images, read_image, read_mask
 from lightdepth.errors import InputError
@@ -54,7 +55,9 @@ def open_sequence(
 
 def _image_folder(path: Path, format: str) -> Path:
     if format == "endomapper":
-        return image_folder(path)
+        return endomapper.image_folder(path)
+    if format == "c3vd":
+        return c3vd.image_folder(path)
     return path / "frames" if (path / "frames").is_dir() else path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import overload
@@ -59,6 +60,19 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(images, key=lambda p: (frame_number(p.name), p.name))
 
 
+def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
+    """Files whose whole name matches `pattern`, by the integer in its first group; 12 and 0012 are the same."""
+    found: dict[int, Path] = {}
+    for file in sorted(folder.iterdir()) if folder.is_dir() else ():
+        match = re.fullmatch(pattern, file.name)
+        if match:
+            number = int(match[1])
+            if number in found:
+                raise InputError(f"{folder}: {found[number].name} and {file.name} have the same number")
+            found[number] = file
+    return found
+
+
 def read_image(path: Path) -> np.ndarray:
     """(H, W, 3) float32 RGB in [0, 1]. 8- and 16-bit files alike."""
     if not path.is_file():
@@ -78,6 +92,24 @@ def read_raw(path: Path) -> np.ndarray:
     if data is None:
         raise InputError(f"{path}: not a readable image (truncated, or not an image at all)")
     return data if data.ndim == 2 else data[..., ::-1]
+
+
+def read_code(path: Path, ray_z: np.ndarray, whose: str) -> np.ndarray:
+    """(H, W) uint16 depth as the file codes it, of the size of the rays. `whose` names the data set in errors."""
+    code = read_raw(path)
+    if code.dtype != np.uint16 or code.ndim != 2:
+        raise InputError(f"{path}: {code.dtype} of shape {code.shape}; {whose}'s depth is one channel of 16 bits")
+    if code.shape != ray_z.shape:
+        raise InputError(
+            f"{path}: depth is {code.shape[1]}x{code.shape[0]}, the image {ray_z.shape[1]}x{ray_z.shape[0]}"
+        )
+    return code
+
+
+def along_ray(depth: np.ndarray, known: np.ndarray, ray_z: np.ndarray) -> np.ndarray:
+    """(H, W) float32 distance of what lies at `depth` along the axis; 0 where unknown, or far to the side."""
+    known = known & (ray_z > 0.05)
+    return np.where(known, depth / np.where(known, ray_z, 1), 0).astype(np.float32)
 
 
 def read_mask(path: Path) -> np.ndarray:
