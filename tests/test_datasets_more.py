@@ -8,11 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from colons import colon
+from colons import CAMERA, colon
 
-from lightdepth.datasets import open_sequence, read_c3vd, write_c3vd
+from lightdepth.datasets import open_sequence, read_c3vd, read_simcol, write_c3vd, write_simcol
 from lightdepth.datasets.c3vd import C3VD, C3VD_V2
 from lightdepth.errors import InputError
+from lightdepth.tube import lens
 
 C3VD_LENSES = {"v1 sorted": C3VD.resized(100, 80), "v2": C3VD_V2.resized(100, 80)}
 
@@ -101,3 +102,120 @@ def test_a_second_edition_with_something_wrong_is_refused_with_what_and_where(ho
     spoil_v2(tmp_path / "seq", how)
     with pytest.raises(InputError, match=SPOILED_V2[how]):
         list(read_c3vd(tmp_path / "seq"))
+
+
+@pytest.fixture
+def simcol(tmp_path) -> Path:
+    """Three frames of a pinhole, as a trajectory of SimCol3D."""
+    write_simcol(colon(0).frames[:3], tmp_path / "SyntheticColon_I" / "Frames_S1")
+    return tmp_path / "SyntheticColon_I" / "Frames_S1"
+
+
+def test_a_trajectory_of_simcol_is_found_by_looking_and_read_back_to_the_depth_s_step(simcol):
+    read = open_sequence(simcol)
+    assert read.names == ["FrameBuffer_0000", "FrameBuffer_0001", "FrameBuffer_0002"]
+    check_against_truth(read, colon(0).frames[:3], 200 / 255 / 2, pose_mm=1e-9)
+    assert read[0].light.source == "assumed"
+    assert read_simcol(simcol).names == read.names
+
+
+def test_the_files_of_simcol_are_named_and_coded_as_they_are_shipped(simcol):
+    above = sorted(p.name for p in simcol.parent.iterdir() if p.is_file())
+    assert above == ["SavedPosition_S1.txt", "SavedRotationQuaternion_S1.txt", "cam.txt"]
+    image = cv2.imread(str(simcol / "FrameBuffer_0000.png"), cv2.IMREAD_UNCHANGED)
+    assert image.dtype == np.uint16 and image.shape == (80, 96, 4) and (image[..., 3] == 65535).all()
+    code = cv2.imread(str(simcol / "Depth_0000.png"), cv2.IMREAD_UNCHANGED)
+    assert code.dtype == np.uint16 and not (code % 256).any() and code.max() <= 65280
+    matrix = np.array((simcol.parent / "cam.txt").read_text().split(), float).reshape(3, 3)
+    np.testing.assert_array_equal(matrix, CAMERA.matrix)
+
+
+def test_unity_s_left_handed_poses_are_turned_into_ours(simcol):
+    """Unity has y up, ours points down: a turn to the right stays one, up is against our y, centimetres become mm."""
+    half = np.sqrt(0.5)
+    (simcol.parent / "SavedPosition_S1.txt").write_text("0 0 0\n1 2 3\n0 0 0\n")
+    (simcol.parent / "SavedRotationQuaternion_S1.txt").write_text(f"0 0 0 1\n0 {half} 0 {half}\n{half} 0 0 {half}\n")
+    still, turned, nodding = (f.true_world_from_cam for f in read_simcol(simcol))
+    np.testing.assert_array_equal(still, np.eye(4))
+    np.testing.assert_allclose(turned[:3, 3], [10, -20, 30])
+    np.testing.assert_allclose(turned[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-9)  # Unity: forward turns to the right
+    np.testing.assert_allclose(nodding[:3, :3] @ [0, 0, 1], [0, 1, 0], atol=1e-9)  # Unity: and then down
+    assert np.linalg.det(turned[:3, :3]) == pytest.approx(1)
+
+
+def test_depth_of_nothing_and_depth_beyond_200_mm_are_both_unknown(simcol):
+    code = np.zeros((80, 96), np.uint16)
+    code[:, 40:], code[:, 80:] = 128 * 256, 255 * 256
+    cv2.imwrite(str(simcol / "Depth_0001.png"), code)
+    distance = open_sequence(simcol)[1].true_distance
+    assert not distance[:, :40].any() and not distance[:, 80:].any()
+    np.testing.assert_allclose((distance * CAMERA.rays()[0][..., 2])[:, 40:80], 128 / 255 * 200, rtol=1e-6)
+
+
+def test_simcol_frames_without_truth_or_camera_are_read_with_the_map_s(simcol):
+    for file in (*simcol.glob("Depth_*"), *simcol.parent.glob("*.txt")):
+        file.unlink()
+    (first, *_) = open_sequence(simcol, map_camera=CAMERA.resized(48, 40))
+    assert first.camera == CAMERA and first.true_distance is None and first.true_world_from_cam is None
+    with pytest.raises(InputError, match=r"Frames_S1: no cam\.txt here or in the folder above.*--camera FILE"):
+        open_sequence(simcol)
+
+
+def test_what_simcol_cannot_hold_is_not_written(tmp_path):
+    with pytest.raises(InputError, match="not numbered 0, 1, 2"):
+        write_simcol(colon(0).frames[1:3], tmp_path / "Frames_S1")
+    with pytest.raises(InputError, match="SCARAMUZZA camera"):
+        write_simcol(colon(0, 3, 6.0, lens("c3vd", 100, 80)).frames, tmp_path / "Frames_S1")
+
+
+def spoil_simcol(folder: Path, how: str) -> None:
+    position = folder.parent / "SavedPosition_S1.txt"
+    rotation = folder.parent / "SavedRotationQuaternion_S1.txt"
+    if how == "eight bits":
+        cv2.imwrite(str(folder / "Depth_0001.png"), np.zeros((80, 96), np.uint8))
+    elif how == "depth of another size":
+        cv2.imwrite(str(folder / "Depth_0001.png"), np.zeros((40, 48), np.uint16))
+    elif how == "truncated":
+        file = folder / "FrameBuffer_0001.png"
+        file.write_bytes(file.read_bytes()[:200])
+    elif how == "no rotations":
+        rotation.unlink()
+    elif how == "a pose too few":
+        for file in (position, rotation):
+            file.write_text("\n".join(file.read_text().splitlines()[:2]) + "\n")
+    elif how == "a rotation too few":
+        rotation.write_text("\n".join(rotation.read_text().splitlines()[:2]) + "\n")
+    elif how == "exchanged":
+        text = position.read_text()
+        position.write_text(rotation.read_text())
+        rotation.write_text(text)
+    elif how == "words":
+        position.write_text("x y z\n")
+    elif how == "zero quaternion":
+        rotation.write_text("0 0 0 1\n0 0 0 0\n0 0 0 1\n")
+    elif how == "NaN":
+        position.write_text("0 0 0\n0 nan 0\n0 0 0\n")
+    elif how == "camera of words":
+        (folder.parent / "cam.txt").write_text("227.6 0 a b 237.5 0 0 0 1\n")
+
+
+SPOILED_SIMCOL = {
+    "eight bits": r"Depth_0001\.png: uint8.*one channel of 16 bits",
+    "depth of another size": r"Depth_0001\.png: depth is 48x40, the image 96x80",
+    "truncated": r"FrameBuffer_0001\.png: not a readable image",
+    "no rotations": r"SavedPosition_S1\.txt: there is no SavedRotationQuaternion_S1\.txt beside it; add it",
+    "a pose too few": r"SavedPosition_S1\.txt: 2 poses, but there is a frame 2",
+    "a rotation too few": r"SavedPosition_S1\.txt: 3 lines, but SavedRotationQuaternion_S1\.txt has 2",
+    "exchanged": r"SavedPosition_S1\.txt: 4 numbers a line; expected `x y z`",
+    "words": r"SavedPosition_S1\.txt: not lines of `x y z`",
+    "zero quaternion": r"SavedRotationQuaternion_S1\.txt: line 2: the quaternion's length is 0; expected 1",
+    "NaN": r"SavedPosition_S1\.txt: line 2 has NaN",
+    "camera of words": r"cam\.txt.*'a', which is not a number",
+}
+
+
+@pytest.mark.parametrize("how", SPOILED_SIMCOL)
+def test_a_trajectory_of_simcol_with_something_wrong_is_refused_with_what_and_where(simcol, how, capfd):
+    spoil_simcol(simcol, how)
+    with pytest.raises(InputError, match=SPOILED_SIMCOL[how]):
+        list(open_sequence(simcol))

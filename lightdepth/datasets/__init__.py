@@ -5,6 +5,7 @@ from lightdepth.datasets.endomapper import read_endomapper, write_endomapper
 from lightdepth.datasets.folder import read_folder, write_folder
 from lightdepth.datasets.reading import FORMATS, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
+from lightdepth.datasets.simcol import read_simcol, write_simcol
 
 __all__ = [
     "FORMATS",
@@ -13,7 +14,9 @@ __all__ = [
     "read_c3vd",
     "read_endomapper",
     "read_folder",
+    "read_simcol",
     "write_c3vd",
     "write_endomapper",
     "write_folder",
+    "write_simcol",
 ]

@@ -6,15 +6,16 @@ from pathlib import Path
 
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
-from lightdepth.datasets import c3vd, endomapper
+from lightdepth.datasets import c3vd, endomapper, simcol
 from lightdepth.datasets.c3vd import is_c3vd, read_c3vd
 from lightdepth.datasets.endomapper import is_endomapper, read_endomapper
 from lightdepth.datasets.folder import read_folder
 from lightdepth.datasets.sequence import FrameSequence, list_images, read_image, read_mask
+from lightdepth.datasets.simcol import is_simcol, read_simcol
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 
-FORMATS = ("folder", "c3vd", "endomapper")
+FORMATS = ("folder", "c3vd", "simcol", "endomapper")
 
 
 def open_sequence(
@@ -36,12 +37,17 @@ def open_sequence(
         found = "is a file" if path.is_file() else "does not exist"
         raise InputError(f"{path}: {found}; expected a folder of frames")
     if format is None:
-        format = "c3vd" if is_c3vd(path) else "endomapper" if is_endomapper(path) else "folder"
+        looks = {"c3vd": is_c3vd, "simcol": is_simcol, "endomapper": is_endomapper}
+        format = next((name for name, fits in looks.items() if fits(path)), "folder")
     chosen_light = read_light(light) if light is not None else None
     chosen_mask = read_mask(Path(mask)) if mask is not None else None
     chosen = _read_camera(Path(camera), _image_folder(path, format)) if camera is not None else None
     if format == "c3vd":
         return read_c3vd(path, chosen, chosen_light, chosen_mask)
+    if format == "simcol":
+        if chosen is None and map_camera is not None and simcol.camera_file(path) is None:
+            chosen = _at_size_of_images(map_camera, path)
+        return read_simcol(path, chosen, chosen_light, chosen_mask)
     if format == "endomapper":
         if chosen is None and map_camera is not None:
             chosen = _at_size_of_images(map_camera, _image_folder(path, format))
