@@ -164,7 +164,7 @@ def predict(
         data: folder of frames
         output: folder to make
         checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
-        format: folder, c3vd, simcol or endomapper; found by looking when left out
+        format: folder, c3vd, simcol, hamlyn or endomapper; found by looking when left out
         camera: calibration file that wins over the folder's
         light: light.json, photometric XML, or gamma=2.2,mu=0, that wins over the folder's
         mask: image, white where tissue shows

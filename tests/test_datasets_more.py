@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 from colons import CAMERA, colon
 
-from lightdepth.datasets import open_sequence, read_c3vd, read_simcol, write_c3vd, write_simcol
+from lightdepth.datasets import (
+    open_sequence,
+    read_c3vd,
+    read_hamlyn,
+    read_simcol,
+    write_c3vd,
+    write_hamlyn,
+    write_simcol,
+)
 from lightdepth.datasets.c3vd import C3VD, C3VD_V2
 from lightdepth.errors import InputError
 from lightdepth.tube import lens
@@ -80,6 +88,8 @@ def spoil_v2(folder: Path, how: str) -> None:
     elif how == "cropped":
         for file in (folder / "rgb").iterdir():
             cv2.imwrite(str(file), cv2.imread(str(file))[:, :80])
+    elif how == "another size":
+        cv2.imwrite(str(folder / "rgb" / "0001.png"), np.zeros((40, 50, 3), np.uint8))
     elif how == "number twice":
         (folder / "rgb" / "1.png").write_bytes((folder / "rgb" / "0001.png").read_bytes())
     elif how == "a pose too few":
@@ -91,6 +101,7 @@ SPOILED_V2 = {
     "eight bits": r"0001_depth\.tiff: uint8.*one channel of 16 bits",
     "depth of another size": r"0001_depth\.tiff: depth is 50x40, the image 100x80",
     "cropped": "seq: images are 80x80; C3VD's camera is for 1350x1080.*--camera FILE",
+    "another size": "0001: the image is 50x40, the camera 100x80",
     "number twice": r"rgb: 0001\.png and 1\.png have the same number",
     "a pose too few": r"pose\.txt: 2 poses, but there is a frame 2",
 }
@@ -219,3 +230,84 @@ def test_a_trajectory_of_simcol_with_something_wrong_is_refused_with_what_and_wh
     spoil_simcol(simcol, how)
     with pytest.raises(InputError, match=SPOILED_SIMCOL[how]):
         list(open_sequence(simcol))
+
+
+@pytest.fixture
+def hamlyn(tmp_path) -> Path:
+    """Three frames of a pinhole, as a rectified sequence of Hamlyn."""
+    write_hamlyn(colon(0).frames[:3], tmp_path / "rectified01")
+    return tmp_path / "rectified01"
+
+
+def test_a_rectified_sequence_of_hamlyn_is_found_by_looking_and_read_back_to_the_millimetre(hamlyn):
+    read = open_sequence(hamlyn)
+    assert read.names == ["0000000000", "0000000001", "0000000002"]
+    for found, frame in zip(read, colon(0).frames[:3], strict=True):
+        assert found.camera == frame.camera and found.true_world_from_cam is None
+        assert np.abs(found.image - frame.image).mean() < 0.02  # JPEG
+        check_depth(found, frame, 0.5)
+    code = cv2.imread(str(hamlyn / "depth01" / "0000000000.png"), cv2.IMREAD_UNCHANGED)
+    assert code.dtype == np.uint16
+    depth = read[0].true_distance * CAMERA.rays()[0][..., 2]
+    np.testing.assert_allclose(depth, code, rtol=1e-5)  # 0 stays 0: nothing was matched there
+
+
+def test_what_a_network_predicted_for_hamlyn_s_tracking_set_is_no_truth(tmp_path):
+    write_hamlyn(colon(0).frames[:2], tmp_path / "seq", "tracking")
+    assert sorted(p.name for p in (tmp_path / "seq").iterdir()) == ["color", "depth", "intrinsics.txt"]
+    read = open_sequence(tmp_path / "seq")
+    assert read[1].camera == CAMERA and read[1].true_distance is None
+
+
+def test_hamlyn_frames_are_paired_by_their_number_however_it_is_written(hamlyn):
+    before = [f.true_distance for f in read_hamlyn(hamlyn)]
+    for i in range(3):
+        (hamlyn / "image01" / f"{i:010d}.jpg").rename(hamlyn / "image01" / f"{i}.jpg")
+    for distance, frame in zip(before, read_hamlyn(hamlyn), strict=True):
+        np.testing.assert_array_equal(frame.true_distance, distance)
+
+
+def test_hamlyn_without_intrinsics_takes_the_map_s_camera_or_a_matrix_of_four_rows(hamlyn):
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.loadtxt(hamlyn / "intrinsics.txt")
+    np.savetxt(hamlyn / "intrinsics.txt", matrix)
+    assert open_sequence(hamlyn)[0].camera == CAMERA
+    (hamlyn / "intrinsics.txt").rename(hamlyn / "other.txt")
+    assert open_sequence(hamlyn, map_camera=CAMERA.resized(48, 40))[0].camera == CAMERA
+    assert open_sequence(hamlyn, camera=hamlyn / "other.txt")[0].camera == CAMERA
+
+
+def spoil_hamlyn(folder: Path, how: str) -> None:
+    if how == "eight bits":
+        cv2.imwrite(str(folder / "depth01" / "0000000001.png"), np.zeros((80, 96), np.uint8))
+    elif how == "depth of another size":
+        cv2.imwrite(str(folder / "depth01" / "0000000001.png"), np.zeros((40, 48), np.uint16))
+    elif how == "no intrinsics":
+        (folder / "intrinsics.txt").unlink()
+    elif how == "number twice":
+        (folder / "image01" / "1.jpg").write_bytes((folder / "image01" / "0000000001.jpg").read_bytes())
+    elif how == "another size":
+        cv2.imwrite(str(folder / "image01" / "0000000001.jpg"), np.zeros((40, 48, 3), np.uint8))
+
+
+SPOILED_HAMLYN = {
+    "eight bits": r"0000000001\.png: uint8.*Hamlyn's depth is one channel of 16 bits",
+    "depth of another size": r"0000000001\.png: depth is 48x40, the image 96x80",
+    "no intrinsics": r"rectified01: no intrinsics\.txt.*--camera FILE",
+    "number twice": r"image01: 0000000001\.jpg and 1\.jpg have the same number",
+    "another size": "0000000001: the image is 48x40, the camera 96x80",
+}
+
+
+@pytest.mark.parametrize("how", SPOILED_HAMLYN)
+def test_a_sequence_of_hamlyn_with_something_wrong_is_refused_with_what_and_where(hamlyn, how):
+    spoil_hamlyn(hamlyn, how)
+    with pytest.raises(InputError, match=SPOILED_HAMLYN[how]):
+        list(open_sequence(hamlyn))
+
+
+def test_a_folder_that_is_no_data_set_is_refused_by_what_was_asked_for(tmp_path):
+    with pytest.raises(InputError, match="neither image01/ and depth01/ nor color/ and depth/"):
+        open_sequence(tmp_path, "hamlyn")
+    with pytest.raises(InputError, match=r"no FrameBuffer_NNNN\.png in it"):
+        open_sequence(tmp_path, "simcol")

@@ -3,6 +3,7 @@
 from lightdepth.datasets.c3vd import read_c3vd, write_c3vd
 from lightdepth.datasets.endomapper import read_endomapper, write_endomapper
 from lightdepth.datasets.folder import read_folder, write_folder
+from lightdepth.datasets.hamlyn import read_hamlyn, write_hamlyn
 from lightdepth.datasets.reading import FORMATS, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.datasets.simcol import read_simcol, write_simcol
@@ -14,9 +15,11 @@ __all__ = [
     "read_c3vd",
     "read_endomapper",
     "read_folder",
+    "read_hamlyn",
     "read_simcol",
     "write_c3vd",
     "write_endomapper",
     "write_folder",
+    "write_hamlyn",
     "write_simcol",
 ]

@@ -6,16 +6,17 @@ from pathlib import Path
 
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
-from lightdepth.datasets import c3vd, endomapper, simcol
+from lightdepth.datasets import c3vd, endomapper, hamlyn, simcol
 from lightdepth.datasets.c3vd import is_c3vd, read_c3vd
 from lightdepth.datasets.endomapper import is_endomapper, read_endomapper
 from lightdepth.datasets.folder import read_folder
+from lightdepth.datasets.hamlyn import is_hamlyn, read_hamlyn
 from lightdepth.datasets.sequence import FrameSequence, list_images, read_image, read_mask
 from lightdepth.datasets.simcol import is_simcol, read_simcol
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 
-FORMATS = ("folder", "c3vd", "simcol", "endomapper")
+FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "endomapper")
 
 
 def open_sequence(
@@ -37,7 +38,7 @@ def open_sequence(
         found = "is a file" if path.is_file() else "does not exist"
         raise InputError(f"{path}: {found}; expected a folder of frames")
     if format is None:
-        looks = {"c3vd": is_c3vd, "simcol": is_simcol, "endomapper": is_endomapper}
+        looks = {"c3vd": is_c3vd, "simcol": is_simcol, "hamlyn": is_hamlyn, "endomapper": is_endomapper}
         format = next((name for name, fits in looks.items() if fits(path)), "folder")
     chosen_light = read_light(light) if light is not None else None
     chosen_mask = read_mask(Path(mask)) if mask is not None else None
@@ -48,6 +49,10 @@ def open_sequence(
         if chosen is None and map_camera is not None and simcol.camera_file(path) is None:
             chosen = _at_size_of_images(map_camera, path)
         return read_simcol(path, chosen, chosen_light, chosen_mask)
+    if format == "hamlyn":
+        if chosen is None and map_camera is not None and not (path / "intrinsics.txt").is_file():
+            chosen = _at_size_of_images(map_camera, _image_folder(path, format))
+        return read_hamlyn(path, chosen, chosen_light, chosen_mask)
     if format == "endomapper":
         if chosen is None and map_camera is not None:
             chosen = _at_size_of_images(map_camera, _image_folder(path, format))
@@ -64,6 +69,8 @@ def _image_folder(path: Path, format: str) -> Path:
         return endomapper.image_folder(path)
     if format == "c3vd":
         return c3vd.image_folder(path)
+    if format == "hamlyn":
+        return hamlyn.image_folder(path)
     return path / "frames" if (path / "frames").is_dir() else path
 
 

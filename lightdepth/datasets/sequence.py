@@ -131,9 +131,10 @@ def read_mask(path: Path) -> np.ndarray:
 def border_mask(images: Sequence[np.ndarray]) -> np.ndarray:
     """(H, W) bool: what is not the black border, found in images (H, W, 3) of one camera by their brightest values.
 
-    The largest bright region with its holes filled (a dark lumen is tissue too), shrunk by 0.4 % of the height.
+    The largest bright region with its holes filled (a dark lumen is tissue too), shrunk by 0.4 % of the height. Images
+    of another size than the first are left out: Frame refuses them by name.
     """
-    bright = np.max([image.max(-1) for image in images], axis=0) > 16 / 255
+    bright = np.max([image.max(-1) for image in images if image.shape == images[0].shape], axis=0) > 16 / 255
     size = max(3, round(0.01 * bright.shape[0])) | 1
     closed = cv2.morphologyEx(bright.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

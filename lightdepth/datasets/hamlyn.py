@@ -1,0 +1,127 @@
+"""Hamlyn, rectified (Endo-Depth-and-Motion): abdominal endoscopy, a pinhole, uint16 depth [mm] along the axis.
+
+| tree | colour | depth | what the depth is |
+|---|---|---|---|
+| rectified | `image01/N.jpg` | `depth01/N.png` | stereo matching: taken as the truth, 0 where it found nothing |
+| tracking | `color/N.jpg` | `depth/N.png` | what a network predicted: no truth, left alone |
+
+Colour and depth are paired by integer. `intrinsics.txt` (3x3 or 4x4) lies beside the folders. Rectification leaves a
+black border: it is masked. There are no poses, and the light is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lightdepth.calibration import read_camera
+from lightdepth.camera import CameraModel, Pinhole
+from lightdepth.datasets.folder import to_bgr8
+from lightdepth.datasets.sequence import (
+    FrameSequence,
+    along_ray,
+    border_mask,
+    numbered_files,
+    read_code,
+    read_image,
+)
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame
+from lightdepth.photometry import PhotometricCalibration
+
+
+@dataclass(frozen=True)
+class _Tree:
+    colour: str
+    depth: str
+    measured: bool
+
+
+_TREES = {"rectified": _Tree("image01", "depth01", True), "tracking": _Tree("color", "depth", False)}
+_COLOUR, _DEPTH = r"(\d+)\.(?:jpg|png)", r"(\d+)\.png"
+
+
+def is_hamlyn(path: Path) -> bool:
+    """Whether a folder has both of a tree's folders, with images in the first."""
+    return _tree(path) is not None
+
+
+def image_folder(path: Path) -> Path:
+    """Where the colour images of a sequence lie."""
+    tree = _tree(path)
+    return path if tree is None else path / tree.colour
+
+
+def read_hamlyn(
+    path: Path,
+    camera: CameraModel | None = None,
+    light: PhotometricCalibration | None = None,
+    mask: np.ndarray | None = None,
+) -> FrameSequence:
+    """Frames of a rectified sequence, with distance where stereo matching measured it."""
+    tree = _tree(path)
+    if tree is None:
+        raise InputError(
+            f"{path}: neither image01/ and depth01/ nor color/ and depth/, with images named by a number; is it a "
+            "sequence of Endo-Depth's Hamlyn set?"
+        )
+    colour, depth = numbered_files(path / tree.colour, _COLOUR), numbered_files(path / tree.depth, _DEPTH)
+    numbers = sorted(colour)
+    if camera is None:
+        file = path / "intrinsics.txt"
+        if not file.is_file():
+            raise InputError(f"{path}: no intrinsics.txt; put the sequence's there, or give --camera FILE")
+        height, width = read_image(colour[numbers[0]]).shape[:2]
+        camera = read_camera(file, (width, height))
+    if mask is None:
+        chosen = numbers[:: max(1, len(numbers) // 8)][:8]
+        mask = border_mask([read_image(colour[n]) for n in chosen])
+    ray_z = camera.rays()[0][..., 2]
+
+    def load(i: int) -> Frame:
+        number = numbers[i]
+        distance = None
+        if tree.measured and number in depth:
+            code = read_code(depth[number], ray_z, "Hamlyn")
+            distance = along_ray(code.astype(np.float32), code > 0, ray_z)
+        return Frame(
+            colour[number].stem,
+            read_image(colour[number]),
+            camera,
+            light or PhotometricCalibration(),
+            mask,
+            true_distance=distance,
+        )
+
+    return FrameSequence([colour[n].stem for n in numbers], load, str(path))
+
+
+def write_hamlyn(frames: Sequence[Frame], path: Path, tree: str = "rectified") -> None:
+    """A sequence as it is shipped ("rectified" or "tracking"), of one pinhole camera, with depth rounded to 1 mm."""
+    if not len(frames):
+        raise InputError(f"{path}: no frames to write")
+    camera, where = frames[0].camera, _TREES[tree]
+    if not isinstance(camera, Pinhole):
+        raise InputError(f"{path}: a {camera.name} camera; intrinsics.txt holds a PINHOLE alone")
+    for folder in (where.colour, where.depth):
+        (path / folder).mkdir(parents=True)
+    for frame in frames:
+        file = path / where.colour / f"{frame.number:010d}.jpg"
+        cv2.imwrite(str(file), to_bgr8(frame.image), [cv2.IMWRITE_JPEG_QUALITY, 100])
+        if frame.true_distance is not None:
+            depth = np.rint(frame.true_distance * camera.rays()[0][..., 2])
+            code = np.clip(depth, 0, 65535).astype(np.uint16)
+            cv2.imwrite(str(path / where.depth / f"{frame.number:010d}.png"), code)
+    matrix = camera.matrix
+    matrix[:2, 2] -= 0.5  # the file's first pixel has its centre at (0, 0)
+    np.savetxt(path / "intrinsics.txt", matrix)
+
+
+def _tree(path: Path) -> _Tree | None:
+    """The tree at a path; None where there is none."""
+    trees = (tree for tree in _TREES.values() if (path / tree.depth).is_dir())
+    return next((tree for tree in trees if numbered_files(path / tree.colour, _COLOUR)), None)
