@@ -23,6 +23,8 @@ from lightdepth.sparse_map import Keyframe, Submap
 
 MAX_MEDIAN_PX = 5.0
 _MIN_SHARE_IN_VIEW = 0.5
+_CELLS = 32  # of the z-buffer along the longer side of the image
+_HIDDEN = 1.5
 
 
 def reprojection(submap: Submap) -> tuple[float, float]:
@@ -64,18 +66,38 @@ def checked(submap: Submap, where: Path) -> Submap:
     return submap
 
 
-def seen_by_projection(submap: Submap) -> Submap:
-    """The submap with every point in a keyframe's view counted as observed at its projection, hidden or not."""
+def seen_by_projection(submap: Submap, hide: bool = False) -> Submap:
+    """The submap with every point in a keyframe's view counted as observed at its projection.
+
+    Hidden or not, unless `hide`: then without those far behind the nearest one of their part of the image.
+    """
     keyframes = []
     for keyframe in submap.keyframes:
-        pixels, valid = keyframe.camera.project(keyframe.in_camera(submap.points))
+        points = keyframe.in_camera(submap.points)
+        pixels, valid = keyframe.camera.project(points)
+        if hide:
+            valid = _unhidden(pixels, np.linalg.norm(points, axis=1), valid, keyframe.camera)
         keyframes.append(replace(keyframe, pixels=pixels[valid], point_ids=submap.point_ids[valid]))
     if not any(len(k.point_ids) for k in keyframes):
         raise InputError(
-            f"map {submap.id}: no keyframe observed a point, and none has a point in its view; are the poses "
-            "camera-from-map (w2c), and do points and poses belong to the same map?"
+            f"map {submap.id}: no keyframe observed a point, and none has a point in its view; are the poses those of "
+            f'the format, or of "pose_convention" in {SIDECAR}, and do points and poses belong to the same map?'
         )
     return replace(submap, keyframes=tuple(keyframes), weak_visibility=True)
+
+
+def _unhidden(pixels: np.ndarray, distance: np.ndarray, valid: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """Which valid points (n,) are no farther than `_HIDDEN` times the nearest in their cell of a coarse z-buffer.
+
+    Coarse, because a sparse map has about one point a cell; lenient, because a wall seen at a grazing angle has many
+    distances in one.
+    """
+    side = max(camera.width, camera.height) / _CELLS
+    column, row = (np.where(valid[:, None], pixels, 0) // side).astype(int).T
+    cell = row * (_CELLS + 1) + column
+    nearest = np.full((_CELLS + 1) ** 2, np.inf)
+    np.minimum.at(nearest, cell[valid], distance[valid])
+    return valid & (distance <= _HIDDEN * nearest[cell])
 
 
 def _each(change: Callable[[Keyframe], Keyframe]) -> Callable[[Submap], Submap]:

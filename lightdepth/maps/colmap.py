@@ -11,7 +11,7 @@ Formats: COLMAP documentation, "Output format".
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,7 +87,14 @@ def read_submap(folder: Path, map_id: int, convention: MapConvention = COLMAP) -
     return assembled(folder, map_id, keyframes, ids, points)
 
 
-def assembled(folder: Path, map_id: int, keyframes: list[Keyframe], ids: np.ndarray, points: np.ndarray) -> Submap:
+def assembled(
+    folder: Path,
+    map_id: int,
+    keyframes: list[Keyframe],
+    ids: np.ndarray,
+    points: np.ndarray,
+    check: Callable[[Submap, Path], Submap] = checked,
+) -> Submap:
     """The checked submap of keyframes, point ids (n,) and points (n, 3); every error names the folder."""
     if not len(points):
         raise InputError(f"{folder}: no points in points3D; an empty map cannot be densified, leave it out")
@@ -100,7 +107,7 @@ def assembled(folder: Path, map_id: int, keyframes: list[Keyframe], ids: np.ndar
         submap = Submap(map_id, tuple(sorted(keyframes, key=lambda k: k.number)), ids, points)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
-    return checked(submap, folder)
+    return check(submap, folder)
 
 
 def _suffix(folder: Path) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from lightdepth.calibration import read_json
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
@@ -33,6 +33,11 @@ class MapConvention:
     pose_convention: str = "w2c"  # direction of the poses in images.txt: "w2c" camera-from-map, "c2w" map-from-camera
     keypoints: str = "distorted"  # "undistorted": keypoints as a pinhole camera of the same K would see them
     frame_offset: int = 0  # added to the number in a keyframe's name, where names do not count as the frames do
+    fps: float | None = None  # frames per second, where a keyframe has a time and no number
+
+    def from_ours(self, camera: CameraModel) -> CameraModel:
+        """A camera in our pixels, brought to the map's: the inverse of what `keyframe` does to it."""
+        return camera.with_pixel_center(1.0 - self.pixel_center)
 
     def keyframe(
         self, name: str, camera: CameraModel, pose: np.ndarray, pixels: np.ndarray, ids: np.ndarray
@@ -52,6 +57,9 @@ COLMAP = MapConvention()
 EXPORTER = MapConvention(pixel_center=0.0)  # ORB-SLAM3 and its descendants keep OpenCV's pixel coordinates
 
 
+_MAX_FRAME = 10**8  # a month of video; a time of day in seconds or nanoseconds lies above
+
+
 def _zero_or_half(value: float) -> float:
     if value not in (0.0, 0.5):
         raise ValueError(f"found {value}; expected 0.0 (OpenCV) or 0.5 (COLMAP)")
@@ -65,11 +73,11 @@ class _Sidecar(BaseModel):
     pixel_center: Annotated[float, AfterValidator(_zero_or_half)] | None = None
     keypoints: Literal["distorted", "undistorted"] | None = None
     frame_offset: int | None = None
+    fps: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     # For whoever writes or views a map; reading one does not need them.
     image_root: str | None = None
     image_pattern: str | None = None
     unit: Literal["arbitrary", "mm"] | None = None
-    fps: float | None = None
 
 
 def declared_convention(folder: Path, map_id: int, habit: MapConvention, roots: tuple[Path, ...] = ()) -> MapConvention:
@@ -84,8 +92,35 @@ def declared_convention(folder: Path, map_id: int, habit: MapConvention, roots: 
         raise InputError(f"{path}: {'.'.join(map(str, first['loc'])) or 'the file'}: {first['msg']}") from error
     if found.map_id is not None and path.parent == folder and found.map_id != map_id:
         raise InputError(f"{path}: map_id {found.map_id} in the folder of map {map_id}; correct one of the two")
-    names = ("pixel_center", "pose_convention", "keypoints", "frame_offset")
+    names = ("pixel_center", "pose_convention", "keypoints", "frame_offset", "fps")
     return replace(habit, **{n: getattr(found, n) for n in names if getattr(found, n) is not None})
+
+
+def frame_names(times: np.ndarray, fps: float | None, where: Path | str) -> list[str]:
+    """Six-digit frame names of times (n,): round(t fps), or without fps the times themselves, which must be integers.
+
+    Raises InputError when times are no frame numbers and nothing says how to count, and when two fall on one frame.
+    """
+    counted = np.asarray(times, np.float64) * (1.0 if fps is None else fps)
+    numbers = np.rint(counted)
+    if fps is None and (numbers != counted).any():
+        raise InputError(
+            f"{where}: the time {times[numbers != counted][0]:g} is not a frame number; put the video's "
+            f'{{"fps": ...}} into {SIDECAR} beside it to count frames by time, or write frame numbers as times'
+        )
+    if (numbers < 0).any() or (numbers > _MAX_FRAME).any():
+        odd = times[(numbers < 0) | (numbers > _MAX_FRAME)][0]
+        raise InputError(
+            f"{where}: the time {odd:g} falls on no frame; expected seconds since the first frame of the video "
+            f"(with fps in {SIDECAR}) or frame numbers, not the time of day and not nanoseconds"
+        )
+    found, counts = np.unique(numbers, return_counts=True)
+    if len(found) < len(numbers):
+        raise InputError(
+            f"{where}: {counts.max()} keyframes fall on frame {found[counts.argmax()]:.0f}; "
+            f"is fps in {SIDECAR} too low?"
+        )
+    return [f"{number:06.0f}.png" for number in numbers]
 
 
 def distorted(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:

@@ -8,11 +8,14 @@ from lightdepth.errors import InputError
 from lightdepth.maps.colmap import holds_model, read_submap
 from lightdepth.maps.convention import COLMAP, EXPORTER, declared_convention
 from lightdepth.maps.endocartoscope import MAPS, read_exported_submap
+from lightdepth.maps.stella import read_stella
+from lightdepth.maps.tum import WITHOUT_POINTS, first_entry, holds_points, holds_trajectory, is_trajectory, read_tum_map
 from lightdepth.sparse_map import SparseMap
 
 _ACCEPTED = (
     "expected a COLMAP model (cameras, images, points3D as .txt or .bin), a folder of numbered models "
-    f"(sparse/0, sparse/1), or a multi-map export ({MAPS}/0, {MAPS}/1)"
+    f"(sparse/0, sparse/1), a multi-map export ({MAPS}/0, {MAPS}/1), a stella_vslam map (.msg), or a TUM trajectory "
+    "with points3D.txt or a PLY, and camera.json"
 )
 
 
@@ -20,18 +23,21 @@ def read_map(path: Path | str) -> SparseMap:
     """A sparse map on disk -> its submaps, by map id.
 
     Reads a COLMAP model folder (its id is the folder's number, or 0), a folder or its `sparse/` with numbered COLMAP
-    models, and the EndoCartoScope / CLiMB tree `3D_maps/<id>` directly below, under `output/` or one run's folder.
+    models, and the EndoCartoScope / CLiMB tree `3D_maps/<id>` directly below, under `output/` or one run's folder;
+    a stella_vslam map (.msg or .json, or the folder with the .msg); a folder with a TUM trajectory and a point cloud.
     Raises InputError saying what was found, where, and what would be right.
     """
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; {_ACCEPTED}")
+    if path.is_file() and path.suffix.lower() in (".msg", ".json"):
+        return SparseMap((read_stella(path),), str(path))
     if not path.is_dir():
         raise InputError(_why_not_file(path))
     tree = _multimap_tree(path)
     if tree is not None:
         return _read_tree(tree, path)
-    if holds_model(path):
+    if holds_model(path) and (path.resolve().parent.name == MAPS or not holds_trajectory(path)):
         map_id = int(path.resolve().name) if _is_number(path.resolve().name) else 0
         exported = path.resolve().parent.name == MAPS
         convention = declared_convention(path, map_id, EXPORTER if exported else COLMAP)
@@ -44,6 +50,14 @@ def read_map(path: Path | str) -> SparseMap:
         if folders:
             conventions = {i: declared_convention(f, i, COLMAP, (root, path)) for i, f in folders.items()}
             return SparseMap(tuple(read_submap(f, i, conventions[i]) for i, f in folders.items()), str(path))
+    if holds_trajectory(path):
+        return SparseMap((read_tum_map(path),), str(path))
+    messages = sorted(path.glob("*.msg"))
+    if len(messages) > 1:
+        found = ", ".join(m.name for m in messages)
+        raise InputError(f"{path}: several stella_vslam maps ({found}); give one of them, e.g. {messages[0]}")
+    if messages:
+        return SparseMap((read_stella(messages[0]),), str(path))
     raise InputError(_why_not_folder(path))
 
 
@@ -98,22 +112,21 @@ def _why_not_file(path: Path) -> str:
             f"{path}: an ORB-SLAM3 atlas, which only the build that wrote it can read; "
             f"export the multi-map tree instead ({MAPS}/<id>/ with cameras.txt, images.txt, points3D.txt)"
         )
-    if path.suffix == ".msg":
-        return f"{path}: a stella_vslam map, which is not read; export it as a COLMAP text model"
+    if path.suffix == ".db":
+        return f"{path}: a data base; if it is stella_vslam's, save the map as .msg instead"
     if path.stem in ("cameras", "images", "points3D"):
         return f"{path}: one file of a COLMAP model; give the folder it is in, {path.parent}"
+    if is_trajectory(path) and holds_points(path.parent):
+        return f"{path}: one file of a map; give the folder it is in, {path.parent}"
     if _is_trajectory(path):
-        return (
-            f"{path}: a trajectory without points; a dense map needs the map's points and which keyframe saw them: "
-            f"give a COLMAP model or the multi-map tree ({MAPS}/<id>/). Or leave the map out and let `sparse` make one"
-        )
+        return f"{path}: {WITHOUT_POINTS}"
     return f"{path}: a file of no known map format; {_ACCEPTED}"
 
 
 def _why_not_folder(path: Path) -> str:
     files = sorted(p for p in path.iterdir() if p.is_file())
     for file in files:
-        if file.suffix in (".osa", ".msg") or (file.suffix in (".txt", ".tum") and _is_trajectory(file)):
+        if file.suffix == ".osa" or (file.suffix in (".txt", ".tum") and _is_trajectory(file)):
             return _why_not_file(file)
     names = sorted(p.name for p in path.iterdir())
     found = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
@@ -121,15 +134,5 @@ def _why_not_folder(path: Path) -> str:
 
 
 def _is_trajectory(path: Path) -> bool:
-    """Whether the first line that is not a comment looks like TUM's `t tx ty tz qx qy qz qw`, or a CLiMB trajectory."""
-    try:
-        with path.open(encoding="utf-8") as lines:
-            line = next((text for text in lines if text.strip() and not text.lstrip().startswith("#")), "")
-    except (OSError, UnicodeDecodeError):
-        return False
-    if line.count(",") >= 8:
-        return True
-    try:
-        return len([float(word) for word in line.split()]) == 8
-    except ValueError:
-        return False
+    """Whether a file looks like a TUM trajectory, or a CLiMB one with its commas."""
+    return is_trajectory(path) or first_entry(path).count(",") >= 8

@@ -1,0 +1,250 @@
+"""Maps of stella_vslam and OpenVSLAM: one file, msgpack (.msg) or the same fields as .json.
+
+    cameras    {name: {model_type, cols, rows, fx, fy, cx, cy, k1, ...}}
+    keyframes  {id: {src_frm_id, ts, cam, rot_cw [x y z w], trans_cw, lm_ids, keypts [{pt: [u, v]}], undists [[u, v]]}}
+    landmarks  {id: {pos_w}}
+
+Poses are camera-from-map, pixels OpenCV's (the first one's centre at (0, 0)), a landmark id of -1 is none. `keypts` are
+where the lens put them, `undists` and the later `undist_keypts` where a pinhole camera with the same K would.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from lightdepth.calibration import read_camera, read_json
+from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
+from lightdepth.errors import InputError
+from lightdepth.maps.colmap import assembled, pose_from_quaternion, quaternion_from_pose
+from lightdepth.maps.convention import EXPORTER, MapConvention, declared_convention, frame_names
+from lightdepth.sparse_map import Keyframe, Submap
+
+_LENSES = {  # model_type -> our model, the fields of its distortion
+    "Perspective": ("OPENCV", ("k1", "k2", "p1", "p2")),
+    "Fisheye": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+}
+
+
+def read_stella(path: Path) -> Submap:
+    """The map in a .msg or .json file, as map 0. Raises InputError naming file and field."""
+    path = Path(path)
+    content = _content(path)
+    convention = declared_convention(path.parent, 0, EXPORTER)
+    cameras = _Cameras(path, content.get("cameras"), convention)
+    keyframes = []
+    for key, entry in _section(content, "keyframes", path).items():
+        keyframes.append(_keyframe(_record(entry, f"{path}: keyframes.{key}"), f"{path}: keyframes.{key}", cameras))
+    ids, points = [], []
+    for key, entry in _section(content, "landmarks", path).items():
+        where = f"{path}: landmarks.{key}"
+        ids.append(_integer(key, where))
+        points.append(_numbers(_record(entry, where), "pos_w", 3, where))
+    if not points:
+        raise InputError(f"{path}: landmarks: no points in it; an empty map cannot be densified")
+    return assembled(path, 0, keyframes, np.array(ids, np.int64), np.array(points).reshape(-1, 3))
+
+
+def _content(path: Path) -> Mapping[str, Any]:
+    if path.suffix.lower() == ".json":
+        content = read_json(path)
+    else:
+        try:
+            content = msgpack.unpackb(path.read_bytes(), strict_map_key=False)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+        except (ValueError, msgpack.exceptions.UnpackException) as error:
+            raise InputError(
+                f"{path}: not msgpack, or copied incompletely ({error or type(error).__name__})"
+            ) from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: found {type(content).__name__}; expected a map with cameras, keyframes, landmarks")
+    return content
+
+
+def _section(content: Mapping[str, Any], name: str, path: Path) -> Mapping[Any, Any]:
+    if name not in content:
+        raise InputError(f"{path}: {name} missing; expected a stella_vslam map with cameras, keyframes, landmarks")
+    return _record(content[name], f"{path}: {name}")
+
+
+def _record(value: Any, where: str) -> Mapping[Any, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: found {type(value).__name__}; expected fields by name")
+    return value
+
+
+def _field(entry: Mapping[Any, Any], name: str, where: str) -> Any:
+    if name not in entry:
+        raise InputError(f"{where}.{name}: missing")
+    return entry[name]
+
+
+def _integer(value: Any, where: str) -> int:
+    try:
+        number = int(value)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{where}: found {value!r}; expected an integer") from None
+    if abs(number) >= 2**63:
+        raise InputError(f"{where}: found {number}; expected an integer below 2^63")
+    return number
+
+
+def _numbers(entry: Mapping[Any, Any], name: str, count: int, where: str) -> np.ndarray:
+    """(count,) finite numbers."""
+    value = _field(entry, name, where)
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise InputError(f"{where}.{name}: found {str(value)[:60]}; expected {count} finite numbers")
+    return numbers
+
+
+# ---- keyframes
+
+
+def _keyframe(entry: Mapping[Any, Any], where: str, cameras: _Cameras) -> Keyframe:
+    convention = cameras.convention
+    x, y, z, w = _numbers(entry, "rot_cw", 4, where)
+    pose = pose_from_quaternion(np.array([w, x, y, z]), _numbers(entry, "trans_cw", 3, where), f"{where}.rot_cw")
+    if "keypts" not in entry:
+        convention = replace(convention, keypoints="undistorted")
+    pixels, name = _keypoints(entry, where)
+    landmarks = _field(entry, "lm_ids", where)
+    if not isinstance(landmarks, list) or len(landmarks) != len(pixels):
+        found = len(landmarks) if isinstance(landmarks, list) else type(landmarks).__name__
+        raise InputError(f"{where}.lm_ids: found {found}; expected one for each of the {len(pixels)} {name}")
+    ids = np.array([_integer(i, f"{where}.lm_ids") for i in landmarks], np.int64)
+    held = ids >= 0
+    if not np.isfinite(pixels[held]).all():
+        raise InputError(f"{where}.{name}: NaN or infinite keypoints; expected pixels")
+    camera = cameras.named(str(_field(entry, "cam", where)))
+    return convention.keyframe(_name(entry, where, convention), camera, pose, pixels[held], ids[held])
+
+
+def _name(entry: Mapping[Any, Any], where: str, convention: MapConvention) -> str:
+    if "src_frm_id" in entry:
+        return f"{_integer(entry['src_frm_id'], f'{where}.src_frm_id'):06d}.png"
+    if convention.fps is None:
+        raise InputError(f"{where}.src_frm_id: missing; put fps into densify_map.json to count frames by ts")
+    return frame_names(_numbers({"ts": [_field(entry, "ts", where)]}, "ts", 1, where), convention.fps, f"{where}.ts")[0]
+
+
+def _keypoints(entry: Mapping[Any, Any], where: str) -> tuple[np.ndarray, str]:
+    """Pixels (n, 2), and the field they came from."""
+    name = next((n for n in ("keypts", "undists", "undist_keypts") if n in entry), None)
+    if name is None:
+        raise InputError(f"{where}: no keypts and no undists; expected one of them, a pixel for each of lm_ids")
+    try:
+        points = [p["pt"] if isinstance(p, dict) else p for p in entry[name]]
+        return np.array(points, np.float64).reshape(len(points), 2), name
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{where}.{name}: expected [u, v], or {{pt: [u, v]}}, for each keypoint") from None
+
+
+# ---- cameras
+
+
+class _Cameras:
+    """The cameras of a file by name: its own where it describes them wholly, else camera.json beside it."""
+
+    def __init__(self, path: Path, section: Any, convention: MapConvention) -> None:
+        self.path, self.section, self.convention = path, section, convention
+        self._known: dict[str, CameraModel] = {}
+
+    def named(self, name: str) -> CameraModel:
+        if name not in self._known:
+            self._known[name] = self._read(name)
+        return self._known[name]
+
+    def _read(self, name: str) -> CameraModel:
+        try:
+            where = f"{self.path}: cameras.{name}"
+            section = _record({} if self.section is None else self.section, f"{self.path}: cameras")
+            return _camera(_record(_field(section, name, f"{self.path}: cameras"), where), where)
+        except InputError as error:
+            beside = self.path.parent / "camera.json"
+            if not beside.is_file():
+                raise InputError(f"{error}; correct it, or put camera.json beside the map") from error
+            return self.convention.from_ours(read_camera(beside))
+
+
+def _camera(entry: Mapping[Any, Any], where: str) -> CameraModel:
+    """In the file's own pixels. Raises InputError for a lens that is not ours, and for a field that is missing."""
+    model = str(_field(entry, "model_type", where))
+    if model not in _LENSES:
+        raise InputError(f"{where}.model_type: found {model!r}; expected {' or '.join(_LENSES)}")
+    name, terms = _LENSES[model]
+
+    def number(field: str) -> float:
+        return float(_numbers({field: [_field(entry, field, where)]}, field, 1, where)[0])
+
+    if model == "Perspective" and "k3" in entry and number("k3") != 0:
+        raise InputError(f"{where}.k3: found {entry['k3']}; expected 0, the lens model has no third radial term")
+    size = (int(number("cols")), int(number("rows")))
+    focal = [number(field) for field in ("fx", "fy", "cx", "cy")]
+    bent = [number(field) for field in terms]
+    try:
+        if name == "OPENCV_FISHEYE":
+            return KannalaBrandt(*size, *focal, *bent)
+        return Brown(*size, *focal, *bent) if any(bent) else Pinhole(*size, *focal)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+# ---- writing
+
+
+def write_stella(submap: Submap, path: Path) -> None:
+    """A submap as stella_vslam has it, .msg or .json by the suffix; without descriptors, so not to be tracked in.
+
+    Keyframes are numbered in their order, src_frm_id is their frame number. Raises InputError for a Scaramuzza lens.
+    """
+    path = Path(path)
+    cameras = list(dict.fromkeys(k.camera for k in submap.keyframes))
+    content = {
+        "cameras": {f"camera {n}": _camera_fields(camera) for n, camera in enumerate(cameras)},
+        "keyframes": {
+            str(n): _keyframe_fields(k, f"camera {cameras.index(k.camera)}") for n, k in enumerate(submap.keyframes)
+        },
+        "landmarks": {
+            str(i): {"pos_w": xyz} for i, xyz in zip(submap.point_ids.tolist(), submap.points.tolist(), strict=True)
+        },
+    }
+    if path.suffix.lower() == ".json":
+        path.write_text(json.dumps(content))
+    else:
+        path.write_bytes(msgpack.packb(content))
+
+
+def _keyframe_fields(keyframe: Keyframe, camera: str) -> dict[str, Any]:
+    w, x, y, z = quaternion_from_pose(keyframe.cam_from_map).tolist()
+    return {
+        "src_frm_id": keyframe.number,
+        "cam": camera,
+        "rot_cw": [x, y, z, w],
+        "trans_cw": keyframe.cam_from_map[:3, 3].tolist(),
+        "n_keypts": len(keyframe.pixels),
+        "keypts": [{"pt": pixel} for pixel in (keyframe.pixels - 0.5).tolist()],
+        "lm_ids": keyframe.point_ids.tolist(),
+    }
+
+
+def _camera_fields(camera: CameraModel) -> dict[str, Any]:
+    models: dict[type, str] = {Pinhole: "Perspective", Brown: "Perspective", KannalaBrandt: "Fisheye"}
+    if type(camera) not in models:
+        raise InputError(f"{camera.name} camera: stella_vslam has no such lens; expected {' or '.join(_LENSES)}")
+    model = models[type(camera)]
+    params = camera.with_pixel_center(1.0).params  # moves the origin by -0.5: ours to OpenCV's
+    terms = dict.fromkeys(_LENSES[model][1], 0.0) | dict(zip(_LENSES[model][1], params[4:], strict=False))
+    focal = dict(zip(("fx", "fy", "cx", "cy"), params[:4], strict=True))
+    third = {"k3": 0.0} if model == "Perspective" else {}
+    return {"model_type": model, "cols": camera.width, "rows": camera.height, **focal, **terms, **third}

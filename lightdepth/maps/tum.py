@@ -1,0 +1,173 @@
+"""A TUM trajectory of keyframes with a point cloud, as users of ORB-SLAM3 have them.
+
+    <folder>/KeyFrameTrajectory.txt, or one *.tum or *.txt     `t tx ty tz qx qy qz qw`, map-from-camera
+    <folder>/points3D.txt, or one *.ply, or one file of `x y z` lines
+    <folder>/camera.json or cameras.txt                        one camera
+    <folder>/densify_map.json                                  `fps`, unless t is a frame number already
+
+Nothing here says which keyframe observed which point. It is guessed: every point in view that no nearer one hides.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lightdepth.calibration import read_camera
+from lightdepth.camera import CameraModel
+from lightdepth.datasets.folder import read_tum
+from lightdepth.errors import InputError
+from lightdepth.maps.checks import seen_by_projection
+from lightdepth.maps.colmap import assembled, is_comment, parse_numbers, read_cameras_text, read_points_text, text_lines
+from lightdepth.maps.convention import EXPORTER, MapConvention, declared_convention, frame_names
+from lightdepth.sparse_map import Submap
+
+TUM = replace(EXPORTER, pose_convention="c2w")
+WITHOUT_POINTS = (
+    "a trajectory without points; a dense map needs the map's points and which keyframe saw them: give a COLMAP model "
+    "or the multi-map tree (3D_maps/<id>/), or put points3D.txt, a PLY or a file of `x y z` lines, and camera.json, "
+    "beside the trajectory. Or leave the map out and let `sparse` make one"
+)
+_KEYFRAMES = "KeyFrameTrajectory.txt"
+_OTHERS = ("cameras.txt", "images.txt", "points3D.txt", "intrinsics.txt")  # numbers in columns too, but not ours
+
+
+def holds_trajectory(folder: Path) -> bool:
+    """Whether a TUM trajectory lies in the folder, and no images file of a model that would say more."""
+    return bool(_trajectories(folder)) and not any(
+        (folder / f"images{suffix}").is_file() for suffix in (".txt", ".bin")
+    )
+
+
+def holds_points(folder: Path) -> bool:
+    return bool(_clouds(folder))
+
+
+def read_tum_map(folder: Path) -> Submap:
+    """The folder's keyframes, named by frame number, and points; what they observed is guessed, with a warning.
+
+    Raises InputError, naming the file and what to add or correct.
+    """
+    trajectory = _only(_trajectories(folder), folder, "trajectories", f"name the one of the keyframes {_KEYFRAMES}")
+    clouds = _clouds(folder)
+    if not clouds:
+        raise InputError(f"{trajectory}: {WITHOUT_POINTS}")
+    cloud = _only(clouds, folder, "point clouds", "leave one")
+    convention = declared_convention(folder, 0, TUM)
+    camera = _camera(folder, convention)
+    times, poses = read_tum(trajectory)
+    names = frame_names(times, convention.fps, trajectory)
+    none = np.zeros((0, 2)), np.zeros(0, np.int64)
+    keyframes = [convention.keyframe(name, camera, pose, *none) for name, pose in zip(names, poses, strict=True)]
+    return assembled(folder, 0, keyframes, *_read_cloud(cloud), check=_guessed)
+
+
+def _guessed(submap: Submap, where: Path) -> Submap:
+    try:
+        submap = seen_by_projection(submap, hide=True)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    warnings.warn(
+        f"{where}: a trajectory and a point cloud do not say which keyframe observed which point; taken to be every "
+        "point in its view that no nearer one hides. Alignment will be weaker: export the keypoints with their point "
+        "ids (COLMAP text) if you can",
+        stacklevel=2,
+    )
+    return submap
+
+
+def _only(paths: list[Path], folder: Path, what: str, cure: str) -> Path:
+    if len(paths) > 1:
+        raise InputError(f"{folder}: several {what} ({', '.join(p.name for p in paths)}); {cure}")
+    return paths[0]
+
+
+def _trajectories(folder: Path) -> list[Path]:
+    if (folder / _KEYFRAMES).is_file():
+        return [folder / _KEYFRAMES]
+    return [p for p in _texts(folder, (".tum", ".txt")) if _columns(p) == 8]
+
+
+def _clouds(folder: Path) -> list[Path]:
+    if (folder / "points3D.txt").is_file():
+        return [folder / "points3D.txt"]
+    lines = [p for p in _texts(folder, (".xyz", ".txt")) if _columns(p) == 3]
+    return sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() == ".ply") + lines
+
+
+def _texts(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in suffixes and p.name not in _OTHERS)
+
+
+def first_entry(path: Path) -> str:
+    """The first line that is not a comment; empty where there is none or the file is not text."""
+    try:
+        with path.open(encoding="utf-8") as lines:
+            return next((line for line in lines if not is_comment(line)), "")
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
+def _columns(path: Path) -> int:
+    """How many numbers the first line holds; 0 when something in it is not a number."""
+    try:
+        return len([float(word) for word in first_entry(path).split()])
+    except ValueError:
+        return 0
+
+
+def is_trajectory(path: Path) -> bool:
+    """Whether the first line looks like TUM's `t tx ty tz qx qy qz qw`."""
+    return path.name not in _OTHERS and _columns(path) == 8
+
+
+def _camera(folder: Path, convention: MapConvention) -> CameraModel:
+    """The folder's camera, its pixels as the map has them: camera.json says what its own are, cameras.txt does not."""
+    if (folder / "camera.json").is_file():
+        return convention.from_ours(read_camera(folder / "camera.json"))
+    path = folder / "cameras.txt"
+    if not path.is_file():
+        raise InputError(f"{folder}: no camera; a trajectory with points needs camera.json or cameras.txt beside them")
+    cameras = list(read_cameras_text(path).values())
+    if len(cameras) != 1:
+        raise InputError(f"{path}: {len(cameras)} cameras; a trajectory does not say whose it is, expected exactly one")
+    return cameras[0]
+
+
+def _read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Point ids (n,) and points (n, 3); ids count from 0 where the file has none."""
+    if path.suffix.lower() == ".ply":
+        points = _read_ply(path)
+    elif _columns(path) == 3:
+        points = _read_xyz(path)
+    else:
+        return read_points_text(path)
+    return np.arange(len(points), dtype=np.int64), points
+
+
+def _read_ply(path: Path) -> np.ndarray:
+    import trimesh
+
+    try:
+        vertices = getattr(trimesh.load(path, process=False), "vertices", None)
+        points = np.array([] if vertices is None else vertices, np.float64).reshape(-1, 3)
+    except Exception as error:  # whatever a broken header makes the reader stumble over
+        raise InputError(f"{path}: not a PLY that can be read ({type(error).__name__}: {error})") from error
+    if not len(points):
+        raise InputError(f"{path}: no points in it; expected a PLY with vertices x y z")
+    return points
+
+
+def _read_xyz(path: Path) -> np.ndarray:
+    points = []
+    for number, line in enumerate(text_lines(path), 1):
+        if is_comment(line):
+            continue
+        where, words = f"{path}, line {number}", line.split()
+        if len(words) != 3:
+            raise InputError(f"{where}: {len(words)} columns; expected x y z")
+        points.append(parse_numbers(words, where, "x y z"))
+    return np.array(points).reshape(-1, 3)
