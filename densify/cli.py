@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from densify.alignment import AlignmentConfig
 from densify.doctor import examine
 from densify.fusion import FusionConfig
@@ -94,6 +96,12 @@ def densify(
         work.write(run, formats, mm_per_unit)
         notes = [f"{data}, {sparse_map.source}; depth by {work.model}; light of the frames: {_light(frames)}."]
         notes += [f"Light {run.record['light_fit']['summary']}."] if "light_fit" in run.record else []
+        weak = [str(s.id) for s in sparse_map.submaps if s.weak_visibility]
+        if weak:
+            notes.append(
+                f"Map {', '.join(weak)} came without observations: which points a keyframe saw was guessed by "
+                "projection, so scales and inliers rest on weaker ground."
+            )
         page = densify_page("Densified maps", work.results, work.baselines, work.gallery, notes)
         page.write(run.folder / "report.html")
         run.log(f"{output}/report.html")
@@ -332,7 +340,7 @@ def _sparse(run: Run, frames: FrameSequence, config: SfmConfig) -> SparseMap:
 
     found = sparse_map_from_frames(frames, run.folder / "sparse", config, show)
     for submap in found.submaps:
-        errors = number(float(_median(submap.reprojection_errors())))
+        errors = number(float(np.median(submap.reprojection_errors())))
         run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
     if found.unregistered:
         run.log(
@@ -364,12 +372,6 @@ def _fitted_light(run: Run, frames: FrameSequence, sparse_map: SparseMap, model:
     )
     run.log(f"light {run.record['light_fit']['summary']}")
     return with_light(frames, fit.light) if fit.better else frames
-
-
-def _median(values: Any) -> float:
-    import numpy as np
-
-    return float(np.median(values)) if len(values) else float("nan")
 
 
 def _share(value: float) -> str:

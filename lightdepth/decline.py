@@ -24,8 +24,7 @@ def masked_blur(values: Tensor, mask: Tensor, sigma: float) -> Tensor:
     if sigma <= 0:
         return values
     size = 2 * int(3 * sigma + 0.5) + 1
-    limit = 2 * min(values.shape[-2:]) - 1  # kornia pads by reflection: the kernel must fit
-    kernel = min(size, limit - 1 if limit % 2 == 0 else limit)
+    kernel = min(size, 2 * min(values.shape[-2:]) - 1)  # kornia pads by reflection: the kernel must fit
     weight = mask.to(values.dtype)
     both = gaussian_blur2d(torch.cat([torch.where(mask, values, 0.0), weight], 1), (kernel, kernel), (sigma, sigma))
     return torch.where(mask, both[:, :1] / both[:, 1:].clamp(min=1e-6), values)

@@ -24,7 +24,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import FrameSequence, along_ray, border_mask, numbered_files, read_code, read_image
+from lightdepth.datasets.sequence import FrameSequence, along_ray, found_mask, numbered_files, read_code, read_image
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
@@ -121,8 +121,7 @@ def read_c3vd(
             )
         camera = whole.resized(width, height)
     if mask is None:
-        chosen = numbers[:: max(1, len(numbers) // 8)][:8]
-        mask = border_mask([read_image(colour[n]) for n in chosen])
+        mask = found_mask([colour[n] for n in numbers])
     ray_z = camera.rays()[0][..., 2]
     names = [f"{n:04d}{tree.suffix.removesuffix('.png')}" for n in numbers]
 

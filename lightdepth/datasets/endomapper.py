@@ -20,7 +20,7 @@ import numpy as np
 from lightdepth.calibration import read_camera, read_json, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_image, read_mask
+from lightdepth.datasets.sequence import FrameSequence, found_mask, list_images, read_image, read_mask
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
@@ -73,8 +73,7 @@ def read_endomapper(
         light = PhotometricCalibration() if file is None else read_light(file)
     if mask is None:
         found = [f for f in (path / "mask.png", image_folder(path) / "mask.png") if f.is_file()]
-        chosen = images[:: max(1, len(images) // 8)][:8]
-        mask = read_mask(found[0]) if found else border_mask([read_image(image) for image in chosen])
+        mask = read_mask(found[0]) if found else found_mask(images)
         if mask.shape != (height, width) and abs(mask.shape[1] / mask.shape[0] / (width / height) - 1) < 0.01:
             mask = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
 

@@ -24,7 +24,7 @@ from lightdepth.datasets.folder import to_bgr8
 from lightdepth.datasets.sequence import (
     FrameSequence,
     along_ray,
-    border_mask,
+    found_mask,
     numbered_files,
     read_code,
     read_image,
@@ -78,8 +78,7 @@ def read_hamlyn(
         height, width = read_image(colour[numbers[0]]).shape[:2]
         camera = read_camera(file, (width, height))
     if mask is None:
-        chosen = numbers[:: max(1, len(numbers) // 8)][:8]
-        mask = border_mask([read_image(colour[n]) for n in chosen])
+        mask = found_mask([colour[n] for n in numbers])
     ray_z = camera.rays()[0][..., 2]
 
     def load(i: int) -> Frame:

@@ -128,6 +128,11 @@ def read_mask(path: Path) -> np.ndarray:
     return mask
 
 
+def found_mask(images: Sequence[Path], count: int = 8) -> np.ndarray:
+    """`border_mask` of a sequence's image files, from `count` of them spread over it."""
+    return border_mask([read_image(image) for image in images[:: max(1, len(images) // count)][:count]])
+
+
 def border_mask(images: Sequence[np.ndarray]) -> np.ndarray:
     """(H, W) bool: what is not the black border, found in images (H, W, 3) of one camera by their brightest values.
 
