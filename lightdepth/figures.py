@@ -69,6 +69,30 @@ def side_by_side(images: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
     return np.concatenate(cells[:-1], 1)
 
 
+def contact_sheet(
+    pictures: Sequence[np.ndarray],
+    labels: Sequence[str],
+    colors: Sequence[tuple[int, int, int]] | None = None,
+    columns: int = 8,
+    width: int = 160,
+) -> np.ndarray:
+    """Pictures (h, w, 3) as thumbnails in rows on white, each framed in its colour with its label beneath."""
+    small = [thumbnail(picture, width) for picture in pictures]
+    height = max(picture.shape[0] for picture in small)
+    edge, text, gap = 3, 16, 6
+    cell_height, cell_width = height + 2 * edge + text + gap, width + 2 * edge + gap
+    columns = min(columns, len(small))
+    sheet = np.full((-(-len(small) // columns) * cell_height + gap, columns * cell_width + gap, 3), 255, np.uint8)
+    for i, (picture, label) in enumerate(zip(small, labels, strict=True)):
+        top, left = gap + i // columns * cell_height, gap + i % columns * cell_width
+        bottom, right = top + picture.shape[0] + 2 * edge, left + width + 2 * edge
+        sheet[top:bottom, left:right] = (190, 190, 190) if colors is None else colors[i]
+        sheet[top + edge : bottom - edge, left + edge : right - edge] = picture
+        where = (left + edge, bottom + text - 4)
+        cv2.putText(sheet[:, :right], label, where, cv2.FONT_HERSHEY_SIMPLEX, 0.36, (60, 60, 60), 1, cv2.LINE_AA)
+    return sheet
+
+
 def chart(size: tuple[float, float] = (6.4, 3.0)) -> tuple[Any, Any]:
     """A matplotlib figure and axes that need no display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -13,6 +13,7 @@ from lightdepth.figures import (
     chart,
     chart_png,
     colored_distance,
+    contact_sheet,
     marked_points,
     mesh_picture,
     png,
@@ -98,3 +99,14 @@ def test_a_chart_needs_no_display(monkeypatch):
     figure, axes = chart((2.0, 1.0))
     axes.plot([1, 2, 3])
     assert decoded(chart_png(figure)).shape == (110, 220, 3)
+
+
+def test_a_contact_sheet_has_rows_of_framed_thumbnails_with_labels():
+    pictures = [np.full((40, 80, 3), 0.1 * i) for i in range(5)]
+    sheet = contact_sheet(pictures, [str(i) for i in range(5)], [GOOD, BAD, GOOD, GOOD, BAD], columns=3, width=60)
+    one = contact_sheet(pictures[:1], ["0"], columns=3, width=60)
+    assert sheet.shape[1] == 3 * (one.shape[1] - 6) + 6 and sheet.shape[0] == 2 * (one.shape[0] - 6) + 6
+    for color, count in ((GOOD, 3), (BAD, 2)):
+        assert (sheet == color).all(-1).sum() == count * (66 * 36 - 60 * 30)
+    assert (one == 190).all(-1).any() and not (sheet[-4:, -60:] != 255).any()  # the last cell of the last row is empty
+    assert (one[46:58] < 120).any()  # the label
