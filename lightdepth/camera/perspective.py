@@ -1,0 +1,117 @@
+"""Cameras that distort the plane z = 1: pinhole and Brown-Conrady."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+
+from lightdepth.camera.arrays import (
+    Array,
+    detached,
+    first_positive_root,
+    interpolated,
+    namespace,
+    rays_through_plane,
+    to_plane,
+)
+from lightdepth.camera.model import TABLE, FocalCamera
+
+
+@dataclass(frozen=True)
+class Pinhole(FocalCamera):
+    """No distortion: u = fx x/z + cx."""
+
+    name: ClassVar[str] = "PINHOLE"
+
+    def _pixels(self, points: Array) -> tuple[Array, Array]:
+        plane, front = to_plane(points)
+        return self._to_pixels(plane), front
+
+    def _rays(self, pixels: Array) -> tuple[Array, Array]:
+        plane = self._to_plane(pixels)
+        return rays_through_plane(plane), namespace(plane).ones_like(plane[..., 0], dtype=bool)
+
+
+@dataclass(frozen=True)
+class Brown(FocalCamera):
+    """Brown-Conrady distortion with two radial and two tangential terms (COLMAP's and OpenCV's OPENCV)."""
+
+    k1: float
+    k2: float
+    p1: float
+    p2: float
+
+    name: ClassVar[str] = "OPENCV"
+
+    def _max_radius(self) -> float:
+        """The radius within which the distortion can be inverted; infinity where it can everywhere."""
+        return _fold(self.k1, self.k2, float(np.hypot(self.p1, self.p2)))
+
+    def _distort(self, plane: Array) -> Array:
+        x, y = plane[..., 0], plane[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + self.k2 * r2)
+        return namespace(plane).stack(
+            [
+                x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
+                y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
+            ],
+            -1,
+        )
+
+    def _newton(self, plane: Array, distorted: Array) -> Array:
+        """One step towards distort(plane) = distorted."""
+        xp, x, y = namespace(plane), plane[..., 0], plane[..., 1]
+        r2 = x * x + y * y
+        radial, slope = 1 + r2 * (self.k1 + self.k2 * r2), 2 * self.k1 + 4 * self.k2 * r2
+        xx = radial + slope * x * x + 2 * self.p1 * y + 6 * self.p2 * x
+        xy = slope * x * y + 2 * self.p1 * x + 2 * self.p2 * y
+        yy = radial + slope * y * y + 6 * self.p1 * y + 2 * self.p2 * x
+        error = self._distort(plane) - distorted
+        det = xx * yy - xy * xy
+        det = xp.where(abs(det) < 1e-9, 1e-9, det)
+        step = xp.stack([yy * error[..., 0] - xy * error[..., 1], xx * error[..., 1] - xy * error[..., 0]], -1)
+        return plane - step / det[..., None]
+
+    def _pixels(self, points: Array) -> tuple[Array, Array]:
+        xp = namespace(points)
+        plane, front = to_plane(points)
+        inside = xp.hypot(plane[..., 0], plane[..., 1]) < self._max_radius()
+        return self._to_pixels(self._distort(xp.where(inside[..., None], plane, 0.0))), front & inside
+
+    def _rays(self, pixels: Array) -> tuple[Array, Array]:
+        distorted, limit = self._to_plane(pixels), self._max_radius()
+        xp, fixed = namespace(distorted), detached(distorted)
+        # Start from the radial part alone, inverted by table over the field that the image needs.
+        r = xp.linalg.norm(fixed, axis=-1, keepdims=True)
+        far = 1.5 * max(1.0, 0.0 if 0 in r.shape else float(r.max())) + 1.0
+        radius = np.linspace(0, min(limit, far), TABLE)
+        table = radius * (1 + radius**2 * (self.k1 + radius**2 * self.k2))
+        plane = fixed / xp.clip(r, 1e-12, None) * interpolated(r, table, radius)
+        for target in [fixed] * 9 + [distorted]:
+            plane = self._newton(plane, target)
+            reached = xp.linalg.norm(plane, axis=-1, keepdims=True)
+            plane = plane * xp.clip(far / xp.clip(reached, 1e-12, None), None, 1.0)
+        error = xp.linalg.norm(self._distort(plane) - distorted, axis=-1)
+        rounding = 32 * float(xp.finfo(fixed.dtype).eps) * (1 + r[..., 0])
+        solved = error < 1e-6 / self.focal_length + rounding
+        return rays_through_plane(plane), solved & (xp.linalg.norm(plane, axis=-1) < limit)
+
+
+@lru_cache(maxsize=64)
+def _fold(k1: float, k2: float, p: float) -> float:
+    """The smallest radius, over all directions, at which the Jacobian of Brown's distortion is singular.
+
+    In axes along and across the direction, with (a, b) the tangential vector of length p in them, it is
+    [[1 + 3 k1 r² + 5 k2 r⁴ + 6 a r, 2 b r], [2 b r, 1 + k1 r² + k2 r⁴ + 2 a r]].
+    """
+
+    def singular(angle: float) -> float:
+        a, b = p * np.cos(angle), p * np.sin(angle)
+        along, across = [5 * k2, 0.0, 3 * k1, 6 * a, 1.0], [k2, 0.0, k1, 2 * a, 1.0]
+        return first_positive_root(np.polysub(np.polymul(along, across), [4 * b * b, 0.0, 0.0]))
+
+    return min(map(singular, np.linspace(0, np.pi, 91 if p else 1)))
