@@ -15,7 +15,18 @@ from pathlib import Path
 from typing import Any
 
 GROUP = "lightdepth.commands"
-ORDER = ("demo", "doctor", "synth", "calibrate-light", "train", "predict", "sparse", "densify", "evaluate")
+ORDER = (
+    "demo",
+    "doctor",
+    "synth",
+    "calibrate-light",
+    "convert-camera",
+    "train",
+    "predict",
+    "sparse",
+    "densify",
+    "evaluate",
+)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -72,7 +83,7 @@ def _parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
             type=Path | None,
             required=needed,
             default=None if needed else default,
-            help="file to write" if verb == "calibrate-light" else "folder to make",
+            help="file to write" if verb in ("calibrate-light", "convert-camera") else "folder to make",
         )
     if "overwrite" in parameters:
         parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run made there")

@@ -13,6 +13,7 @@ from scenes import BROWN, C3VD, ENDOMAPPER, PINHOLE
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, Scaramuzza
+from lightdepth.datasets.c3vd import C3VD_V2
 from lightdepth.errors import InputError
 from lightdepth.photometry import PhotometricCalibration
 
@@ -87,11 +88,61 @@ def test_a_camera_survives_the_files_that_can_hold_it(tmp_path, suffix, camera):
 
 @pytest.mark.parametrize(("suffix", "camera"), [("yaml", C3VD), ("txt", C3VD), ("xml", C3VD), ("xml", BROWN)])
 def test_a_camera_that_a_format_cannot_hold_is_refused_with_the_way_out(tmp_path, suffix, camera):
-    with pytest.raises(InputError, match=rf"camera\.{suffix}: .*convert_camera"):
+    with pytest.raises(InputError, match=rf"camera\.{suffix}: .*convert-camera .*--model \w+"):
         write_camera(camera, tmp_path / f"camera.{suffix}")
     assert not (tmp_path / f"camera.{suffix}").exists()
     with pytest.raises(InputError, match=r"camera\.dat: no camera format ends in '\.dat'"):
         write_camera(camera, tmp_path / "camera.dat")
+
+
+@pytest.mark.parametrize(("name", "format"), [("calib_results.txt", None), ("mine.dat", "ocamcalib")])
+@pytest.mark.parametrize("camera", [C3VD, C3VD_V2, C3VD.resized(300, 216)], ids=["v1", "v2", "resized"])
+def test_ocamcalib_holds_a_scaramuzza_camera(tmp_path, name, format, camera):
+    write_camera(camera, tmp_path / name, format)
+    again = read_camera(tmp_path / name)
+    assert isinstance(again, Scaramuzza) and (again.width, again.height) == (camera.width, camera.height)
+    np.testing.assert_allclose(again.params, camera.params, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("camera", [C3VD, C3VD_V2, C3VD.resized(300, 216)], ids=["v1", "v2", "resized"])
+def test_the_toolbox_projects_with_the_inverse_polynomial_as_we_do(tmp_path, camera):
+    """world2cam by hand: x down, y right, z backward; rho a polynomial of atan(z / hypot(x, y))."""
+    write_camera(camera, tmp_path / "calib_results.txt")
+    numbers = [
+        [float(v) for v in line.split()]
+        for line in (tmp_path / "calib_results.txt").read_text().splitlines()
+        if line and not line.startswith("#")
+    ]
+    (_, *inverse), (row, column), (c, d, e) = numbers[1:4]
+    theta, phi = np.radians([0.5, 10, 40, 60, 85])[:, None], np.radians([0, 100, 190, 300])
+    points = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], -1)
+    x, y, z = points[..., 1], points[..., 0], -points[..., 2]
+    side = np.hypot(x, y)
+    rho = np.polyval(inverse[::-1], np.arctan(z / side))
+    x, y = x / side * rho, y / side * rho
+    theirs = np.stack([e * x + y + column, c * x + d * y + row], -1) + 0.5
+    np.testing.assert_allclose(theirs, camera.project(points)[0], atol=0.02)
+
+
+@pytest.mark.parametrize(("format", "side"), [(None, 3), ("intrinsics", 3), ("intrinsics4x4", 4)])
+def test_intrinsics_hold_a_pinhole_without_its_size(tmp_path, format, side):
+    write_camera(PINHOLE, tmp_path / "intrinsics.txt", format)
+    assert np.loadtxt(tmp_path / "intrinsics.txt").shape == (side, side)
+    assert np.loadtxt(tmp_path / "intrinsics.txt")[0, 2] == PINHOLE.cx - 0.5
+    assert read_camera(tmp_path / "intrinsics.txt", (640, 480)) == PINHOLE
+
+
+def test_a_format_without_a_place_for_the_camera_names_the_models_it_has(tmp_path):
+    for camera, format, message in (
+        (PINHOLE, "ocamcalib", "ocamcalib has no PINHOLE camera; .*--model SCARAMUZZA"),
+        (BROWN, "intrinsics", r"intrinsics\.txt has no OPENCV camera; .*--model PINHOLE"),
+        (BROWN, "vicalib", "tangential terms; it can be converted to OPENCV_FISHEYE or PINHOLE"),
+        (C3VD.resized(1350, 200), "ocamcalib", "ocamcalib's is about 1: resize"),
+        (PINHOLE, "kalibr", "format 'kalibr' is not known; expected one of json, vicalib"),
+    ):
+        with pytest.raises(InputError, match=message):
+            write_camera(camera, tmp_path / "camera.txt", format)
+        assert not list(tmp_path.iterdir())
 
 
 def test_vicalib_s_first_pixel_is_at_0_and_its_lens_is_kannala_brandt(tmp_path):

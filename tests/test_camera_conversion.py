@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scenes import C3VD, ENDOMAPPER
 
+from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.camera_conversion import convert_camera
+from lightdepth.cli import main
 from lightdepth.errors import InputError
 from lightdepth.tube import octagon
 
@@ -82,3 +85,47 @@ def test_an_unknown_model_and_an_empty_mask_are_refused():
         convert_camera(camera, "FOV")
     with pytest.raises(InputError, match="no valid pixel in the mask"):
         convert_camera(camera, "OPENCV", np.zeros((80, 96), bool))
+
+
+def test_the_verb_converts_a_file_and_says_by_how_much_it_differs(tmp_path, capsys):
+    camera, mask = SMALL["SCARAMUZZA"], octagon(SMALL["SCARAMUZZA"])
+    write_camera(camera, tmp_path / "calib_results.txt")
+    cv2.imwrite(str(tmp_path / "mask.png"), mask.astype(np.uint8) * 255)
+    argv = ["convert-camera", str(tmp_path / "calib_results.txt"), "-o", str(tmp_path / "new" / "cameras.txt")]
+    argv += ["--model", "OPENCV_FISHEYE", "--mask", str(tmp_path / "mask.png")]
+    assert main(argv) == 0
+    expected = convert_camera(read_camera(tmp_path / "calib_results.txt"), "OPENCV_FISHEYE", mask)
+    assert read_camera(tmp_path / "new" / "cameras.txt").params == pytest.approx(expected.camera.params)
+    said = capsys.readouterr().out
+    assert f"residual {expected.median_px:.2g} px (median), {expected.max_px:.2g} px (largest)" in said
+    assert f"{100 * expected.seen_share:.1f} % of the field" in said
+    assert main(argv) == 3 and "already there; choose another -o" in capsys.readouterr().err
+    assert main([*argv, "--overwrite"]) == 0
+
+
+def test_the_verb_writes_the_same_model_in_another_format_as_it_is(tmp_path, capsys):
+    camera = SMALL["OPENCV_FISHEYE"]
+    write_camera(camera, tmp_path / "camera.json")
+    assert main(["convert-camera", str(tmp_path / "camera.json"), "-o", str(tmp_path / "camera.xml")]) == 0
+    assert "OPENCV_FISHEYE, as it was read" in capsys.readouterr().out
+    assert read_camera(tmp_path / "camera.xml").params == pytest.approx(camera.params)
+
+
+def test_the_verb_gives_a_file_its_size_and_refuses_another_aspect(tmp_path, capsys):
+    write_camera(SMALL["PINHOLE"], tmp_path / "intrinsics.txt", "intrinsics4x4")
+    argv = ["convert-camera", str(tmp_path / "intrinsics.txt"), "-o", str(tmp_path / "camera.json")]
+    assert main(argv) == 3 and "holds no image size" in capsys.readouterr().err
+    assert main([*argv, "--size", "[96, 80]"]) == 0
+    assert read_camera(tmp_path / "camera.json") == SMALL["PINHOLE"]
+    argv = ["convert-camera", str(tmp_path / "camera.json"), "-o", str(tmp_path / "small.yaml"), "--size"]
+    assert main([*argv, "[48, 48]"]) == 3 and "is for 96x80; expected the same aspect" in capsys.readouterr().err
+    assert main([*argv, "[48, 40]"]) == 0
+    assert read_camera(tmp_path / "small.yaml").params == pytest.approx(SMALL["PINHOLE"].resized(48, 40).params)
+
+
+def test_the_verb_says_to_which_model_a_camera_has_to_be_converted(tmp_path, capsys):
+    write_camera(SMALL["SCARAMUZZA"], tmp_path / "camera.json")
+    assert main(["convert-camera", str(tmp_path / "camera.json"), "-o", str(tmp_path / "out.txt")]) == 3
+    said = capsys.readouterr().err
+    assert "COLMAP has no SCARAMUZZA camera; it can be converted to OPENCV_FISHEYE or OPENCV or PINHOLE" in said
+    assert not (tmp_path / "out.txt").exists()

@@ -49,7 +49,18 @@ def test_help_lists_the_verbs_in_the_order_of_the_work_each_with_its_line(capsys
     assert lightdepth("--help") == 0
     lines = capsys.readouterr().out.splitlines()
     verbs = [line.split()[0] for line in lines if line.startswith("  ")]
-    assert verbs == ["demo", "doctor", "synth", "calibrate-light", "train", "predict", "sparse", "densify", "evaluate"]
+    assert verbs == [
+        "demo",
+        "doctor",
+        "synth",
+        "calibrate-light",
+        "convert-camera",
+        "train",
+        "predict",
+        "sparse",
+        "densify",
+        "evaluate",
+    ]
     assert all(len(line.split()) > 4 for line in lines if line.startswith("  "))
     assert lightdepth() == 2
 

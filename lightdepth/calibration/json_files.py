@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
+from lightdepth.calibration.plain_text import write_text
 from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.errors import InputError
 from lightdepth.photometry import PhotometricCalibration
@@ -68,7 +69,7 @@ def read_camera_json(path: Path) -> CameraModel:
 
 def write_camera_json(camera: CameraModel, path: Path) -> None:
     data = {"model": camera.name, "width": camera.width, "height": camera.height, "params": list(camera.params)}
-    Path(path).write_text(json.dumps({**data, "pixel_center": 0.5}, indent=1) + "\n")
+    write_text(path, json.dumps({**data, "pixel_center": 0.5}, indent=1) + "\n")
 
 
 def light_from_text(text: str) -> PhotometricCalibration:
@@ -94,4 +95,4 @@ def _light(data: Any, where: str) -> PhotometricCalibration:
 
 
 def write_light_json(light: PhotometricCalibration, path: Path) -> None:
-    Path(path).write_text(json.dumps(asdict(light), indent=1) + "\n")
+    write_text(path, json.dumps(asdict(light), indent=1) + "\n")

@@ -1,24 +1,28 @@
 """ocamcalib's calib_results.txt: Scaramuzza's omnidirectional camera, as the toolbox exports it.
 
-Five lines of numbers between comments: the polynomial (how many coefficients, then ss0, ss1, ...), its inverse (not
-used: ours is computed), the centre as row and column, the affine c d e, the size as height and width.
+Five lines of numbers between comments: the polynomial (how many coefficients, then ss0, ss1, ...), its inverse (rho
+over atan(z / hypot(x, y)); not read: ours is computed), the centre as row and column, the affine c d e, the size as
+height and width.
 
 Notation: x down the rows, y along the columns, z away from the scene; a pixel is (row, column) = [[c, d], [e, 1]]
 (x, y) + centre, and its ray (x, y, ss0 + ss1 rho + ...), so ss0 < 0. The exporter subtracts MATLAB's 1 from the centre:
 the first pixel's centre is at (0, 0).
 
 Ours has x right, y down, z into the scene: with the sensor's unit scaled by c, as the last entry of our stretch is 1,
-a_i = -ss_i c^(1 - i) and the stretch is [[1/c, e/c], [d/c, 1]]. This is exact.
+a_i = -ss_i c^(1 - i) and the stretch is [[1/c, e/c], [d/c, 1]]. This is exact, both ways.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from lightdepth.calibration.plain_text import read_text, rows, to_numbers
-from lightdepth.camera import CameraModel, camera_from_params
+import numpy as np
+
+from lightdepth.calibration.plain_text import cannot_hold, read_text, rows, to_numbers, write_text
+from lightdepth.camera import CameraModel, Scaramuzza, camera_from_params
 from lightdepth.errors import InputError
 
+_INVERSE_ERROR_PX = 0.01  # the toolbox's own
 _LINES = "calib_results.txt with five lines: polynomial, inverse polynomial, centre, affine c d e, height and width"
 
 
@@ -57,3 +61,35 @@ def read_ocamcalib(path: Path) -> CameraModel:
     ours = [-a * c ** (1 - i) for i, a in enumerate(poly)]
     params = [column, row, *ours, 1 / c, e / c, d / c]
     return camera_from_params("SCARAMUZZA", int(width), int(height), params, str(path)).with_pixel_center(0.0)
+
+
+def write_ocamcalib(camera: CameraModel, path: Path) -> None:
+    """A calib_results.txt, its inverse polynomial within 0.01 pixels over the camera's field (where degree 14 can)."""
+    if not isinstance(camera, Scaramuzza):
+        raise cannot_hold(path, "ocamcalib", f"{camera.name} camera", "SCARAMUZZA")
+    if not 2 / 3 <= camera.c <= 2:  # as the reader wants it
+        raise InputError(f"{path}: c = {camera.c:g}; ocamcalib's is about 1: resize the camera evenly both ways")
+    theirs = camera.with_pixel_center(1.0)
+    c, d, e = 1 / camera.c, camera.e / camera.c, camera.d / camera.c
+    polynomial = [-a * c ** (i - 1) for i, a in enumerate(theirs.params[2:7])]
+    inverse = _inverse(camera)
+    lines: dict[str, list[float]] = {
+        "polynomial coefficients, ss0 first": [5, *polynomial],
+        "inverse polynomial coefficients": [len(inverse), *inverse],
+        "centre: row and column, from 0": [theirs.cy, theirs.cx],
+        "affine parameters c, d, e": [c, d, e],
+        "image size: height and width": [camera.height, camera.width],
+    }
+    write_text(path, "\n".join(f"#{what}\n\n{' '.join(repr(v) for v in numbers)}\n" for what, numbers in lines.items()))
+
+
+def _inverse(camera: Scaramuzza) -> list[float]:
+    """rho in ocamcalib's units as a polynomial of ocamcalib's angle, which is theta - 90 degrees."""
+    theta = np.linspace(0, 0.999 * camera.max_theta(), 1000)
+    pixels = camera.project(np.stack([np.sin(theta), 0 * theta, np.cos(theta)], -1))[0]
+    rho = camera.c * np.linalg.norm(camera._sensor(pixels), axis=-1)
+    for degree in range(5, 15):
+        fit = np.polynomial.Polynomial.fit(theta - np.pi / 2, rho, degree).convert()
+        if np.abs(fit(theta - np.pi / 2) - rho).max() < _INVERSE_ERROR_PX:
+            break
+    return fit.coef.tolist()

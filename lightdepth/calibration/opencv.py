@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lightdepth.calibration.plain_text import read_text, to_numbers
+from lightdepth.calibration.plain_text import cannot_hold, read_text, to_numbers, write_text
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, camera_from_params
 from lightdepth.errors import InputError
 
@@ -131,7 +131,7 @@ def write_opencv(camera: CameraModel, path: Path) -> None:
     elif isinstance(camera, KannalaBrandt):
         model, coefficients = "fisheye", list(camera.params[4:])
     else:
-        raise InputError(f"{path}: OpenCV knows no {camera.name} camera; convert_camera to OPENCV_FISHEYE first")
+        raise cannot_hold(path, "OpenCV", f"{camera.name} camera", "OPENCV_FISHEYE", "OPENCV", "PINHOLE")
     fx, fy, cx, cy = camera.with_pixel_center(1.0).params[:4]  # half a pixel back, to OpenCV's
 
     def matrix(name: str, height: int, numbers: list[float]) -> str:
@@ -139,9 +139,10 @@ def write_opencv(camera: CameraModel, path: Path) -> None:
         shape = f"   rows: {height}\n   cols: {len(numbers) // height}\n   dt: d\n"
         return f"{name}: !!opencv-matrix\n{shape}   data: [ {data} ]\n"
 
-    Path(path).write_text(
+    write_text(
+        path,
         f"%YAML:1.0\n---\nimage_width: {camera.width}\nimage_height: {camera.height}\n"
         + matrix("camera_matrix", 3, [fx, 0, cx, 0, fy, cy, 0, 0, 1])
         + f"distortion_model: {model}\n"
-        + matrix("distortion_coefficients", 1, coefficients)
+        + matrix("distortion_coefficients", 1, coefficients),
     )

@@ -1,4 +1,5 @@
-"""Cameras in plain text: COLMAP's cameras.txt, and intrinsics.txt with a bare camera matrix.
+"""Text files, read and written whole; and cameras in plain text: COLMAP's cameras.txt, and intrinsics.txt with a bare
+camera matrix.
 
 COLMAP's first pixel has its centre at (0.5, 0.5), as ours. intrinsics.txt (Hamlyn, EndoSLAM and others) comes out of
 OpenCV's calibration: there it is at (0, 0).
@@ -6,6 +7,7 @@ OpenCV's calibration: there it is at (0, 0).
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,21 @@ def read_text(path: Path, expected: str) -> str:
     if "\0" in text:
         raise InputError(f"{path}: not a text file; {expected}")
     return text
+
+
+def write_text(path: Path, text: str) -> None:
+    """The file, whole or not at all."""
+    partial = Path(path).with_name(f".{Path(path).name}.partial")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+def cannot_hold(path: Path, program: str, what: str, *models: str) -> InputError:
+    """The error for a camera that a format has no place for, with the models that it has."""
+    return InputError(
+        f"{path}: {program} has no {what}; it can be converted to {' or '.join(models)}: "
+        f"lightdepth convert-camera FILE -o OUT --model {models[0]}"
+    )
 
 
 def rows(text: str) -> list[list[str]]:
@@ -62,10 +79,10 @@ def read_colmap_camera(path: Path) -> CameraModel:
 def write_colmap_camera(camera: CameraModel, path: Path) -> None:
     """cameras.txt with the camera as id 1."""
     if isinstance(camera, Scaramuzza):
-        raise InputError(f"{path}: COLMAP knows no SCARAMUZZA camera; convert_camera to OPENCV_FISHEYE first")
+        raise cannot_hold(path, "COLMAP", "SCARAMUZZA camera", "OPENCV_FISHEYE", "OPENCV", "PINHOLE")
     numbers = " ".join(repr(float(p)) for p in camera.params)
-    Path(path).write_text(
-        f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {camera.name} {camera.width} {camera.height} {numbers}\n"
+    write_text(
+        path, f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {camera.name} {camera.width} {camera.height} {numbers}\n"
     )
 
 
@@ -93,6 +110,15 @@ def read_intrinsics(path: Path, size: tuple[int, int] | None) -> Pinhole:
     camera = camera_from_params("PINHOLE", *size, [fx, fy, cx, cy], str(path)).with_pixel_center(0.0)
     assert isinstance(camera, Pinhole)
     return camera
+
+
+def write_intrinsics(camera: CameraModel, path: Path, side: int = 3) -> None:
+    """The camera matrix, side x side (3 or 4). The image size is lost."""
+    if not isinstance(camera, Pinhole):
+        raise cannot_hold(path, "intrinsics.txt", f"{camera.name} camera", "PINHOLE")
+    fx, fy, cx, cy = camera.with_pixel_center(1.0).params  # half a pixel back, to OpenCV's
+    matrix = _intrinsics(fx, fy, cx, cy, 0.0, side)
+    write_text(path, "".join(" ".join(repr(float(v)) for v in row) + "\n" for row in matrix))
 
 
 def _intrinsics(fx: float, fy: float, cx: float, cy: float, skew: float, side: int) -> np.ndarray:

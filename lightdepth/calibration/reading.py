@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from lightdepth.calibration.json_files import (
@@ -12,9 +14,16 @@ from lightdepth.calibration.json_files import (
     write_camera_json,
     write_light_json,
 )
-from lightdepth.calibration.ocamcalib import is_ocamcalib, read_ocamcalib
+from lightdepth.calibration.ocamcalib import is_ocamcalib, read_ocamcalib, write_ocamcalib
 from lightdepth.calibration.opencv import read_opencv, write_opencv
-from lightdepth.calibration.plain_text import read_colmap_camera, read_intrinsics, read_text, rows, write_colmap_camera
+from lightdepth.calibration.plain_text import (
+    read_colmap_camera,
+    read_intrinsics,
+    read_text,
+    rows,
+    write_colmap_camera,
+    write_intrinsics,
+)
 from lightdepth.calibration.vicalib import read_photometric, read_vicalib, write_photometric, write_vicalib
 from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.errors import InputError
@@ -24,6 +33,18 @@ CAMERA_FORMATS = (
     "camera.json, vicalib XML (EndoMapper), OpenCV YAML, COLMAP cameras.txt, ocamcalib calib_results.txt, or "
     "intrinsics.txt (3x3 or 4x4 numbers)"
 )
+
+
+_WRITERS: dict[str, Callable[[CameraModel, Path], None]] = {
+    "json": write_camera_json,
+    "vicalib": write_vicalib,
+    "opencv": write_opencv,
+    "colmap": write_colmap_camera,
+    "ocamcalib": write_ocamcalib,
+    "intrinsics": write_intrinsics,
+    "intrinsics4x4": partial(write_intrinsics, side=4),
+}
+_SUFFIXES = {".json": "json", ".xml": "vicalib", ".yaml": "opencv", ".yml": "opencv", ".txt": "colmap"}
 
 
 def read_camera(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
@@ -53,19 +74,22 @@ def read_camera(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
     raise InputError(f"{path}: not a camera calibration that is known; expected {CAMERA_FORMATS}")
 
 
-def write_camera(camera: CameraModel, path: Path) -> None:
-    """To the format that the suffix stands for: .json ours, .xml vicalib, .yaml OpenCV, .txt COLMAP's cameras.txt."""
-    writers = {
-        ".json": write_camera_json,
-        ".xml": write_vicalib,
-        ".yaml": write_opencv,
-        ".yml": write_opencv,
-        ".txt": write_colmap_camera,
-    }
+def write_camera(camera: CameraModel, path: Path, format: str | None = None) -> None:
+    """To a format: json, vicalib, opencv, colmap, ocamcalib, intrinsics or intrinsics4x4. The file appears whole.
+
+    Left out, it follows the name: .json ours, .xml vicalib, .yaml OpenCV; calib_results*.txt ocamcalib, intrinsics*.txt
+    the 3x3 matrix, any other .txt COLMAP's cameras.txt. Raises InputError where the format cannot hold the camera.
+    """
+    name = Path(path).name.lower()
     suffix = Path(path).suffix.lower()
-    if suffix not in writers:
-        raise InputError(f"{path}: no camera format ends in {suffix!r}; expected one of {', '.join(writers)}")
-    writers[suffix](camera, Path(path))
+    if format is None and suffix == ".txt" and name.startswith(("calib_results", "intrinsics")):
+        format = "ocamcalib" if name.startswith("c") else "intrinsics"
+    format = format or _SUFFIXES.get(suffix)
+    if format not in _WRITERS:
+        found = f"format {format!r} is not known" if format else f"no camera format ends in {suffix!r}"
+        known = ", ".join(_WRITERS if format else _SUFFIXES)
+        raise InputError(f"{path}: {found}; expected one of {known}")
+    _WRITERS[format](camera, Path(path))
 
 
 def read_light(source: str | Path) -> PhotometricCalibration:

@@ -19,7 +19,7 @@ import defusedxml.ElementTree
 import numpy as np
 from defusedxml import DefusedXmlException
 
-from lightdepth.calibration.plain_text import read_text, to_numbers
+from lightdepth.calibration.plain_text import cannot_hold, read_text, to_numbers, write_text
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, camera_from_params
 from lightdepth.errors import InputError
 from lightdepth.photometry import PhotometricCalibration
@@ -59,13 +59,14 @@ def write_vicalib(camera: CameraModel, path: Path) -> None:
     elif isinstance(camera, Pinhole):
         kind = _PINHOLE
     else:
-        what = "tangential terms" if isinstance(camera, Brown) else f"{camera.name} camera"
-        raise InputError(f"{path}: vicalib's XML has no {what}; convert_camera to OPENCV_FISHEYE first")
-    Path(path).write_text(
+        what = "OPENCV camera with tangential terms" if isinstance(camera, Brown) else f"{camera.name} camera"
+        raise cannot_hold(path, "vicalib's XML", what, "OPENCV_FISHEYE", "PINHOLE")
+    write_text(
+        path,
         "<rig>\n    <camera>\n"
         f'        <camera_model name="" index="0" serialno="0" type="{kind}" version="8">\n'
         f"            <width> {camera.width} </width>\n            <height> {camera.height} </height>\n"
-        f"            <params> {_row(params)} </params>\n        </camera_model>\n    </camera>\n</rig>\n"
+        f"            <params> {_row(params)} </params>\n        </camera_model>\n    </camera>\n</rig>\n",
     )
 
 
@@ -104,12 +105,13 @@ def read_photometric(path: Path) -> PhotometricCalibration:
 def write_photometric(light: PhotometricCalibration, path: Path) -> None:
     """EndoMapper's photometric calibration. It has no place for gain, reflectance and source."""
     metres = [v / 1000 for v in light.position_mm]
-    Path(path).write_text(
+    write_text(
+        path,
         '<rig>\n    <camera>\n        <camera_model index="0" name="" serialno="0" type="gamma" version="1.0">\n'
         f"            <gamma> {_row([light.gamma])} </gamma>\n        </camera_model>\n    </camera>\n"
         '    <light>\n        <light_model type="sls" version="1.0">\n            <sigma> 1.0 </sigma>\n'
         f"            <mu> {light.mu!r} </mu>\n            <P> {_row(metres)} </P>\n"
-        f"            <D> {_row(light.direction)} </D>\n        </light_model>\n    </light>\n</rig>\n"
+        f"            <D> {_row(light.direction)} </D>\n        </light_model>\n    </light>\n</rig>\n",
     )
 
 
