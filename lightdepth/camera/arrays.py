@@ -6,6 +6,7 @@ is of. Here is what they do not share, and what needs care for gradients: 0/0 on
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -93,7 +94,8 @@ def at_radius(points: Array, side: Array, rho: Array, focal: float) -> Array:
     return points[..., :2] * scale[..., None]
 
 
-def first_positive_root(coefficients: list[float] | np.ndarray) -> float:
+@lru_cache(maxsize=256)
+def first_positive_root(*coefficients: float) -> float:
     """Smallest positive real root of a polynomial (highest power first); infinity when there is none."""
     roots = np.roots(coefficients)
     real = roots[np.abs(roots.imag) < 1e-9 * np.maximum(1, np.abs(roots.real))].real

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import ClassVar, Self
 
 import numpy as np
@@ -36,7 +37,7 @@ class KannalaBrandt(FocalCamera):
 
     def max_theta(self) -> float:
         """Half the field on which the model can be inverted, radians."""
-        turn = np.sqrt(first_positive_root([9 * self.k4, 7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0]))
+        turn = np.sqrt(first_positive_root(9 * self.k4, 7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0))
         return float(min(turn, MAX_THETA))
 
     def _radius(self, theta: Array) -> Array:
@@ -109,25 +110,14 @@ class Scaramuzza(CameraModel):
     def _height_slope(self, rho: Array) -> Array:
         return self.a1 + rho * (2 * self.a2 + rho * (3 * self.a3 + rho * 4 * self.a4))
 
-    def _table(self) -> tuple[np.ndarray, np.ndarray]:
-        """theta over rho, as far as it grows and stays below 90 degrees."""
-        corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]])
-        # By the lens, not by the image size: a crop has the field of the whole image
-        reach = max(4 * self.a0, 2 * float(np.linalg.norm(self._sensor(corners), axis=-1).max()))
-        rho = np.linspace(0, reach, TABLE * 2)
-        theta = np.arctan2(rho, self._height(rho))
-        stop = np.flatnonzero((np.diff(theta) <= 0) | (theta[1:] >= MAX_THETA))
-        end = int(stop[0]) + 1 if len(stop) else len(rho)
-        return rho[:end], theta[:end]
-
     def max_theta(self) -> float:
         """Half the field on which the model can be inverted, radians."""
-        return float(self._table()[1][-1])
+        return float(_theta_over_rho(self)[1][-1])
 
     def _pixels(self, points: Array) -> tuple[Array, Array]:
         xp = namespace(points)
         theta, side, exists = angle_from_axis(points)
-        table_rho, table_theta = self._table()
+        table_rho, table_theta = _theta_over_rho(self)
         limit = float(table_theta[-1])
         valid = exists & (theta < limit)
         theta = xp.clip(theta, None, limit)
@@ -146,7 +136,7 @@ class Scaramuzza(CameraModel):
         sensor = self._sensor(pixels)
         rho = length(sensor[..., 0], sensor[..., 1])
         rays = unit(namespace(sensor).concatenate([sensor, self._height(rho)[..., None]], -1))
-        return rays, rho < float(self._table()[0][-1])
+        return rays, rho < float(_theta_over_rho(self)[0][-1])
 
     def resized(self, width: int, height: int) -> Self:
         sx, sy = width / self.width, height / self.height
@@ -166,3 +156,16 @@ class Scaramuzza(CameraModel):
 
     def _shifted(self, x: float, y: float) -> Self:
         return replace(self, cx=self.cx + x, cy=self.cy + y)
+
+
+@lru_cache(maxsize=64)
+def _theta_over_rho(camera: Scaramuzza) -> tuple[np.ndarray, np.ndarray]:
+    """(rho, theta), as far as theta grows and stays below 90 degrees."""
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]])
+    # By the lens, not by the image size: a crop has the field of the whole image
+    reach = max(4 * camera.a0, 2 * float(np.linalg.norm(camera._sensor(corners), axis=-1).max()))
+    rho = np.linspace(0, reach, TABLE * 2)
+    theta = np.arctan2(rho, camera._height(rho))
+    stop = np.flatnonzero((np.diff(theta) <= 0) | (theta[1:] >= MAX_THETA))
+    end = int(stop[0]) + 1 if len(stop) else len(rho)
+    return rho[:end], theta[:end]

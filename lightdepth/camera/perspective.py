@@ -112,6 +112,6 @@ def _fold(k1: float, k2: float, p: float) -> float:
     def singular(angle: float) -> float:
         a, b = p * np.cos(angle), p * np.sin(angle)
         along, across = [5 * k2, 0.0, 3 * k1, 6 * a, 1.0], [k2, 0.0, k1, 2 * a, 1.0]
-        return first_positive_root(np.polysub(np.polymul(along, across), [4 * b * b, 0.0, 0.0]))
+        return first_positive_root(*np.polysub(np.polymul(along, across), [4 * b * b, 0.0, 0.0]))
 
     return min(map(singular, np.linspace(0, np.pi, 91 if p else 1)))
