@@ -7,7 +7,7 @@ distortion. The rays through the pixels of the first camera are the data; least 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -140,3 +140,28 @@ _RESIDUALS: dict[type[CameraModel], _Residuals] = {
     KannalaBrandt: _pixel_residuals,
     Scaramuzza: _ray_residuals,
 }
+
+
+def without_k3(camera: Brown, k3: float) -> tuple[Brown, float]:
+    """The Brown camera closest to `camera` with OpenCV's third radial term k3 added, and by how many pixels it is off.
+
+    The focal lengths and the principal point stay, so that the fit is linear. The second number is the largest
+    difference in the image.
+    """
+    steps = np.linspace(0, 1, 33)
+    border = np.array([p for t in steps for p in ((t, 0), (t, 1), (0, t), (1, t))])
+    rays, _ = camera.unproject(border * (camera.width, camera.height))
+    reach = 1.05 * np.abs(rays[:, :2] / rays[:, 2:]).max(0)
+    x, y = (axis.ravel() for axis in np.meshgrid(*(np.linspace(-r, r, 81) for r in reach)))
+    r2 = x * x + y * y
+    plane = np.stack([x, y], -1)
+    wanted = camera._distort(plane) + plane * (k3 * r2**3)[:, None]
+    pixels = camera._to_pixels(wanted)
+    inside = (pixels >= 0).all(-1) & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height)
+    across = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x], -1)
+    down = np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y], -1)
+    terms = np.concatenate([across[inside], down[inside]])
+    k1, k2, p1, p2 = np.linalg.lstsq(terms, (wanted - plane)[inside].T.ravel())[0].tolist()
+    found = replace(camera, k1=k1, k2=k2, p1=p1, p2=p2)
+    off = np.linalg.norm(camera._to_pixels(found._distort(plane)) - pixels, axis=1)
+    return found, float(off[inside].max())

@@ -75,6 +75,8 @@ def check_image_size(name: str, width: int, height: int, camera: CameraModel) ->
         return
     sx, sy = width / camera.width, height / camera.height
     found = f"{name}: the image is {width}x{height}, the camera {camera.width}x{camera.height}"
+    if (camera.width, camera.height) == (height, width) and width != height:
+        raise InputError(f"{found}: width and height are swapped in the calibration")
     if abs(sx / sy - 1) < 0.01:
         raise InputError(
             f"{found}: ratio {sx:.4g}. If the image was only resized, rescale the camera: multiply fx, fy, cx, cy by "

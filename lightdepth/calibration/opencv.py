@@ -36,16 +36,7 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):  # the second is OpenCV 5's f
 
 def read_opencv(path: Path) -> CameraModel:
     """The camera of an OpenCV YAML. Keys in any case; what is not about the camera is passed over."""
-    text = read_text(path, "expected an OpenCV YAML").lstrip("\ufeff")
-    # OpenCV's first line, `%YAML:1.0`, is no YAML.
-    text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
-    try:
-        data = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())[:200]})") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: no keys in it; expected camera_matrix, distortion_coefficients and the image size")
-    fields = {str(key).lower(): value for key, value in data.items()}
+    fields = _fields(path)
     width, height = (_size(fields, key, path) for key in ("image_width", "image_height"))
     matrix = _numbers(fields, "camera_matrix", path)
     if len(matrix) != 9 or matrix[3] or matrix[6:] != [0, 0, 1] or abs(matrix[1]) > 1e-9:
@@ -57,6 +48,29 @@ def read_opencv(path: Path) -> CameraModel:
     kind, coefficients = _distortion(model, coefficients, path)
     params = [matrix[0], matrix[4], matrix[2], matrix[5], *coefficients]
     return camera_from_params(kind, width, height, params, str(path)).with_pixel_center(0.0)
+
+
+def read_matrices(path: Path, names: tuple[str, ...]) -> dict[str, list[float]]:
+    """The numbers of named matrices in an OpenCV YAML, row by row: a stereo calibration's M1, D1, T."""
+    fields = _fields(path)
+    missing = [name for name in names if fields.get(name.lower()) is None]
+    if missing:
+        raise InputError(f"{path}: {', '.join(missing)} missing; expected the matrices {', '.join(names)}")
+    return {name: _numbers(fields, name.lower(), path) for name in names}
+
+
+def _fields(path: Path) -> dict[str, Any]:
+    """Everything in the file, by its key in small letters."""
+    text = read_text(path, "expected an OpenCV YAML").lstrip("\ufeff")
+    # OpenCV's first line, `%YAML:1.0`, is no YAML.
+    text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
+    try:
+        data = yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())[:200]})") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: no keys in it; expected camera_matrix, distortion_coefficients and the image size")
+    return {str(key).lower(): value for key, value in data.items()}
 
 
 def _distortion(model: str, found: list[float], path: Path) -> tuple[str, list[float]]:

@@ -83,7 +83,10 @@ def read_photometric(path: Path) -> PhotometricCalibration:
     position, direction = (_numbers(light, tag, path, 3) for tag in "PD")
     distance = float(np.linalg.norm(position))
     if distance > _FARTHEST_LIGHT_M:
-        raise InputError(f"{path}: P is {distance:g} from the lens; expected metres, below {_FARTHEST_LIGHT_M:g}")
+        raise InputError(
+            f"{path}: P is {distance:g} from the lens; expected metres, below {_FARTHEST_LIGHT_M:g}. This looks like "
+            "millimetres: divide it by 1000"
+        )
     if light.find("sigma") is not None:
         (sigma,) = _numbers(light, "sigma", path, 1)
         if sigma != 1:

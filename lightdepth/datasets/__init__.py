@@ -5,6 +5,7 @@ from lightdepth.datasets.endomapper import read_endomapper, write_endomapper
 from lightdepth.datasets.folder import read_folder, write_folder
 from lightdepth.datasets.hamlyn import read_hamlyn, write_hamlyn
 from lightdepth.datasets.reading import FORMATS, open_sequence
+from lightdepth.datasets.scared import read_scared, write_scared
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.datasets.simcol import read_simcol, write_simcol
 
@@ -16,10 +17,12 @@ __all__ = [
     "read_endomapper",
     "read_folder",
     "read_hamlyn",
+    "read_scared",
     "read_simcol",
     "write_c3vd",
     "write_endomapper",
     "write_folder",
     "write_hamlyn",
+    "write_scared",
     "write_simcol",
 ]

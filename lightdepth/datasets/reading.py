@@ -8,15 +8,17 @@ from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import c3vd, endomapper, hamlyn, simcol
 from lightdepth.datasets.c3vd import is_c3vd, read_c3vd
+from lightdepth.datasets.checks import check_sequence
 from lightdepth.datasets.endomapper import is_endomapper, read_endomapper
 from lightdepth.datasets.folder import read_folder
 from lightdepth.datasets.hamlyn import is_hamlyn, read_hamlyn
+from lightdepth.datasets.scared import is_scared, read_scared
 from lightdepth.datasets.sequence import FrameSequence, list_images, read_image, read_mask
 from lightdepth.datasets.simcol import is_simcol, read_simcol
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 
-FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "endomapper")
+FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "scared", "endomapper")
 
 
 def open_sequence(
@@ -27,18 +29,35 @@ def open_sequence(
     mask: str | Path | None = None,
     map_camera: CameraModel | None = None,
 ) -> FrameSequence:
-    """Frames at `path`, of a format found by looking or named; lazy.
+    """Frames at `path`, of a format found by looking or named; lazy but for a few frames that are checked.
 
     `camera`, `light`, `mask` are files (light also `gamma=2.2,mu=0`) that win over what is in the folder;
     `map_camera` serves where neither a file nor the format gives a camera, and wins over EndoMapper's calibration:
-    its own maps were made with other numbers.
+    its own maps were made with other numbers. `check_sequence` says what is doubtful.
     """
+    return check_sequence(_open(path, format, camera, light, mask, map_camera))
+
+
+def _open(
+    path: str | Path,
+    format: str | None,
+    camera: str | Path | None,
+    light: str | Path | None,
+    mask: str | Path | None,
+    map_camera: CameraModel | None,
+) -> FrameSequence:
     path = Path(path)
     if not path.is_dir():
         found = "is a file" if path.is_file() else "does not exist"
         raise InputError(f"{path}: {found}; expected a folder of frames")
     if format is None:
-        looks = {"c3vd": is_c3vd, "simcol": is_simcol, "hamlyn": is_hamlyn, "endomapper": is_endomapper}
+        looks = {
+            "c3vd": is_c3vd,
+            "simcol": is_simcol,
+            "hamlyn": is_hamlyn,
+            "scared": is_scared,
+            "endomapper": is_endomapper,
+        }
         format = next((name for name, fits in looks.items() if fits(path)), "folder")
     chosen_light = read_light(light) if light is not None else None
     chosen_mask = read_mask(Path(mask)) if mask is not None else None
@@ -53,6 +72,8 @@ def open_sequence(
         if chosen is None and map_camera is not None and not (path / "intrinsics.txt").is_file():
             chosen = _at_size_of_images(map_camera, _image_folder(path, format))
         return read_hamlyn(path, chosen, chosen_light, chosen_mask)
+    if format == "scared":
+        return read_scared(path, chosen, chosen_light, chosen_mask)
     if format == "endomapper":
         if chosen is None and map_camera is not None:
             chosen = _at_size_of_images(map_camera, _image_folder(path, format))

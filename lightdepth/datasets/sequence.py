@@ -17,15 +17,25 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 class FrameSequence(Sequence[Frame]):
-    """Frames by index, each read from disk when it is asked for. `names` and `numbers` cost no reading."""
+    """Frames by index, each read from disk when it is asked for. `names` and `numbers` cost no reading.
 
-    def __init__(self, names: Sequence[str], load: Callable[[int], Frame], source: str):
+    `sampled` are the frames by which the sequence is checked when it is opened: first, middle and last where left out.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        load: Callable[[int], Frame],
+        source: str,
+        sampled: Sequence[int] | None = None,
+    ):
         if not names:
             raise InputError(f"{source}: no frames in it; expected images with a number in their names")
         self.names = list(names)
         self.numbers = [frame_number(name) for name in names]
         self.source = source
         self._load = load
+        self.sampled = tuple(sorted({0, len(names) // 2, len(names) - 1})) if sampled is None else tuple(sampled)
         twice = {n for n in self.numbers if self.numbers.count(n) > 1} if len(set(self.numbers)) < len(names) else set()
         if twice:
             same = [name for name, n in zip(self.names, self.numbers, strict=True) if n == min(twice)]
@@ -88,10 +98,15 @@ def read_raw(path: Path) -> np.ndarray:
     """The file's own numbers, channels in the file's order (cv2's reversal undone)."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if data is None:
-        raise InputError(f"{path}: not a readable image (truncated, or not an image at all)")
-    return data if data.ndim == 2 else data[..., ::-1]
+    return decode_raw(path.read_bytes(), str(path))
+
+
+def decode_raw(data: bytes, where: str) -> np.ndarray:
+    """`read_raw` of a file's bytes; `where` names them in errors."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if image is None:
+        raise InputError(f"{where}: not a readable image (truncated, or not an image at all)")
+    return image if image.ndim == 2 else image[..., ::-1]
 
 
 def read_code(path: Path, ray_z: np.ndarray, whose: str) -> np.ndarray:
