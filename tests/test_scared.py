@@ -142,7 +142,10 @@ def test_a_distorted_lens_is_kept_and_its_k3_folded_into_the_others_with_what_is
     frames = colon(0, 3, 6.0, BROWN).frames
     write_scared(frames, tmp_path / "seq", archives=False)
     check_against_truth(open_sequence(tmp_path / "seq"), frames, BROWN)
-    for k3, message in ((0.004, r"k3 = 0\.004 is folded into the other coefficients, off by 0\.\d+ pixels"), (2.0, None)):
+    for k3, message in (
+        (0.004, r"k3 = 0\.004 is folded into the other coefficients, off by 0\.\d+ pixels"),
+        (2.0, None),
+    ):
         for file in (tmp_path / "seq" / "data" / "frame_data").iterdir():
             record = json.loads(file.read_text())
             record["camera-calibration"]["DL"][4] = k3

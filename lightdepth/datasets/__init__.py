@@ -2,6 +2,7 @@
 
 from lightdepth.datasets.c3vd import read_c3vd, write_c3vd
 from lightdepth.datasets.endomapper import read_endomapper, write_endomapper
+from lightdepth.datasets.endoslam import read_endoslam, write_endoslam
 from lightdepth.datasets.folder import read_folder, write_folder
 from lightdepth.datasets.hamlyn import read_hamlyn, write_hamlyn
 from lightdepth.datasets.reading import FORMATS, open_sequence
@@ -15,12 +16,14 @@ __all__ = [
     "open_sequence",
     "read_c3vd",
     "read_endomapper",
+    "read_endoslam",
     "read_folder",
     "read_hamlyn",
     "read_scared",
     "read_simcol",
     "write_c3vd",
     "write_endomapper",
+    "write_endoslam",
     "write_folder",
     "write_hamlyn",
     "write_scared",

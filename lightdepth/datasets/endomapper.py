@@ -5,7 +5,11 @@ The frames lie in img_train/, images/, frames/ or the folder itself; N counts fr
 Calibrations/ (in a folder for each endoscope, or without) here and in the folders above. Where there is more than one
 endoscope, `Seq_NNN_info.json` says which it was. Calibrations are for 1440x1080, and are resized to smaller frames of
 that shape. mask.png, in the folder or beside the frames, is white where tissue shows; without one the black border is
-found.
+found. Times need the video's frame rate: `fps` in Seq_NNN_info.json, or the Seq_NNN.mov beside it.
+
+The COLMAP clusters of Seq_001 and Seq_002 (a folder such as 33/, with img_train/, sparse/<M>, cluster_list/<M>.txt) are
+read whole by that folder, and one by one by `33/sparse/<M>` (the frames of that model) or `33/cluster_list/<M>.txt`
+(the frames that were given to it), with the camera of that model. The models are `read_map`'s.
 """
 
 from __future__ import annotations
@@ -37,8 +41,23 @@ def is_endomapper(path: Path) -> bool:
     return named or any(path.glob(f"Endoscope_*_{_GEOMETRY}.xml"))
 
 
+def cluster_of(path: Path) -> tuple[Path, int] | None:
+    """The folder and the number of a COLMAP cluster, of a path FOLDER/sparse/<M> or FOLDER/cluster_list/<M>.txt."""
+    path = path.resolve()
+    folder, listed = path.parent.parent, path.parent.name == "cluster_list" and path.suffix == ".txt" and path.is_file()
+    if not (listed or (path.parent.name == "sparse" and path.is_dir())) or not path.stem.isdecimal():
+        return None
+    images = list_images(_frames_of(folder))
+    return (folder, int(path.stem)) if any(re.fullmatch(r"out\d+", image.stem) for image in images) else None
+
+
 def image_folder(path: Path) -> Path:
-    """Where the frames of a sequence lie."""
+    """Where the frames of a sequence, or of a cluster, lie."""
+    cluster = cluster_of(path)
+    return _frames_of(path if cluster is None else cluster[0])
+
+
+def _frames_of(path: Path) -> Path:
     return next((path / name for name in ("img_train", "images", "frames") if (path / name).is_dir()), path)
 
 
@@ -49,9 +68,16 @@ def read_endomapper(
     mask: np.ndarray | None = None,
     fps: float | None = None,
 ) -> FrameSequence:
-    """Frames of extracted video. What is given here wins over the files; time is (N - 1) / fps where `fps` is given
-    (40 or 50 in the data set). Raises InputError where no camera is found."""
+    """Frames of extracted video, or of one cluster. What is given here wins over the files; time is (N - 1) / fps where
+    `fps` (40 or 50 in the data set) is given or found. Raises InputError where no camera is found."""
     images = list_images(image_folder(path))
+    cluster, source = cluster_of(path), path
+    if cluster is not None:
+        images, own = _in_cluster(path, images)
+        path = cluster[0]
+        if camera is None and own is not None and images:
+            height, width = read_image(images[0]).shape[:2]
+            camera = _at_size(own, width, height, images[0].name)
     if not images:
         raise InputError(f"{image_folder(path)}: no images with a number in their names; expected out1.png, out2.png")
     if frame_number(images[0].name) < 1:
@@ -76,13 +102,14 @@ def read_endomapper(
         mask = read_mask(found[0]) if found else found_mask(images)
         if mask.shape != (height, width) and abs(mask.shape[1] / mask.shape[0] / (width / height) - 1) < 0.01:
             mask = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    fps = fps or _fps(path)
 
     def load(i: int) -> Frame:
         number = frame_number(images[i].name)
         time = None if fps is None else (number - 1) / fps
         return Frame(images[i].stem, read_image(images[i]), camera, light, mask, time=time)
 
-    return FrameSequence([image.stem for image in images], load, str(path))
+    return FrameSequence([image.stem for image in images], load, str(source))
 
 
 def write_endomapper(frames: Sequence[Frame], path: Path, endoscope: str = "00") -> None:
@@ -100,6 +127,58 @@ def write_endomapper(frames: Sequence[Frame], path: Path, endoscope: str = "00")
         cv2.imwrite(str(path / "mask.png"), frames[0].mask.astype(np.uint8) * 255)
     for frame in frames:
         cv2.imwrite(str(path / "img_train" / f"out{frame.number}.png"), to_bgr8(frame.image))
+
+
+def _in_cluster(path: Path, images: list[Path]) -> tuple[list[Path], CameraModel | None]:
+    """The images of a cluster, and the camera of its model where there is one."""
+    from lightdepth.maps import read_map  # which reads trajectories with datasets.folder
+
+    cluster = cluster_of(path)
+    assert cluster is not None
+    model = cluster[0] / "sparse" / path.stem
+    keyframes = read_map(model).submaps[0].keyframes if model.is_dir() else ()
+    if path.suffix == ".txt":
+        names = path.read_text(errors="replace").split()
+        odd = [name for name in names if not re.fullmatch(r"(?:.*[/\\])?out\d+(?:\.\w+)?", name)]
+        if odd or not names:
+            raise InputError(
+                f"{path}: {odd[0][:60] if odd else 'nothing in it'}; expected the frames' names, out<N>.png"
+            )
+        numbers = {frame_number(name) for name in names}
+    else:
+        numbers = {keyframe.number for keyframe in keyframes}
+    missing = sorted(numbers - {frame_number(image.name) for image in images})
+    if missing:
+        raise InputError(
+            f"{path}: {len(missing)} of its {len(numbers)} frames are not there, the first is out{missing[0]}"
+        )
+    chosen = [image for image in images if frame_number(image.name) in numbers]
+    return chosen, keyframes[0].camera if keyframes else None
+
+
+def _fps(path: Path) -> float | None:
+    """Frames per second: what the sequence's info file says, else the video's own; None where there is neither."""
+    for folder in _upwards(path):
+        for file in sorted(folder.glob("Seq_*_info.json")):
+            data = read_json(file)
+            found = data.get("fps") if isinstance(data, dict) else None
+            if isinstance(found, int | float) and 1 <= found <= 1000:
+                return float(found)
+        videos = sorted(folder.glob("Seq_*.mov"))
+        if len(videos) == 1:
+            return _frame_rate(videos[0])
+    return None
+
+
+def _frame_rate(video: Path) -> float | None:
+    import av
+
+    try:
+        with av.open(str(video)) as container:
+            rate = container.streams.video[0].average_rate
+    except (OSError, IndexError, av.error.FFmpegError):
+        return None
+    return float(rate) if rate else None
 
 
 def _at_size(camera: CameraModel, width: int, height: int, name: str) -> CameraModel:

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
-from lightdepth.datasets import c3vd, endomapper, hamlyn, simcol
+from lightdepth.datasets import c3vd, endomapper, endoslam, hamlyn, simcol
 from lightdepth.datasets.c3vd import is_c3vd, read_c3vd
 from lightdepth.datasets.checks import check_sequence
 from lightdepth.datasets.endomapper import is_endomapper, read_endomapper
+from lightdepth.datasets.endoslam import is_endoslam, read_endoslam
 from lightdepth.datasets.folder import read_folder
 from lightdepth.datasets.hamlyn import is_hamlyn, read_hamlyn
 from lightdepth.datasets.scared import is_scared, read_scared
@@ -18,7 +19,7 @@ from lightdepth.datasets.simcol import is_simcol, read_simcol
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 
-FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "scared", "endomapper")
+FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "scared", "endoslam", "endomapper")
 
 
 def open_sequence(
@@ -47,7 +48,9 @@ def _open(
     map_camera: CameraModel | None,
 ) -> FrameSequence:
     path = Path(path)
-    if not path.is_dir():
+    if format in (None, "endomapper") and endomapper.cluster_of(path) is not None:
+        format = "endomapper"
+    elif not path.is_dir():
         found = "is a file" if path.is_file() else "does not exist"
         raise InputError(f"{path}: {found}; expected a folder of frames")
     if format is None:
@@ -56,6 +59,7 @@ def _open(
             "simcol": is_simcol,
             "hamlyn": is_hamlyn,
             "scared": is_scared,
+            "endoslam": is_endoslam,
             "endomapper": is_endomapper,
         }
         format = next((name for name, fits in looks.items() if fits(path)), "folder")
@@ -74,6 +78,10 @@ def _open(
         return read_hamlyn(path, chosen, chosen_light, chosen_mask)
     if format == "scared":
         return read_scared(path, chosen, chosen_light, chosen_mask)
+    if format == "endoslam":
+        if chosen is None and map_camera is not None and endoslam.camera_file(path) is None:
+            chosen = _at_size_of_images(map_camera, _image_folder(path, format))
+        return read_endoslam(path, chosen, chosen_light, chosen_mask)
     if format == "endomapper":
         if chosen is None and map_camera is not None:
             chosen = _at_size_of_images(map_camera, _image_folder(path, format))
@@ -92,6 +100,8 @@ def _image_folder(path: Path, format: str) -> Path:
         return c3vd.image_folder(path)
     if format == "hamlyn":
         return hamlyn.image_folder(path)
+    if format == "endoslam":
+        return endoslam.image_folder(path)
     return path / "frames" if (path / "frames").is_dir() else path
 
 
