@@ -15,7 +15,7 @@ from scenes import cylinder
 
 from lightdepth.camera import Pinhole
 from lightdepth.cli import main
-from lightdepth.datasets import write_folder
+from lightdepth.datasets import FORMATS, write_folder
 from lightdepth.photometry import PhotometricCalibration
 
 HEAVY = ("torch", "numpy", "cv2", "open3d", "pycolmap", "scipy", "jsonargparse", "matplotlib")
@@ -82,6 +82,7 @@ def test_every_verb_explains_its_options(verb, capsys):
     shown = capsys.readouterr().out
     assert "Args:" not in shown and "--output" in shown
     assert "(type:" in shown and "folder" in shown
+    assert "--format" not in shown or all(name in shown for name in FORMATS)
 
 
 @pytest.fixture(scope="module")

@@ -255,6 +255,25 @@ def test_c3vd_without_depth_and_poses_is_a_sequence_without_truth(c3vd):
     assert all(f.true_distance is None and f.true_world_from_cam is None for f in read_c3vd(c3vd))
 
 
+def test_a_screening_of_c3vd_has_tracker_poses_in_either_order_and_no_depth(tmp_path):
+    """`N_color.png` and pose.txt; the frames start anywhere, and their poses are found by number."""
+    given = [replace(f, true_distance=None) for f in colon(0, 6, 6.0, LENS).frames]
+    write_c3vd(given, tmp_path / "screening_t1")
+    for i in range(6):
+        (tmp_path / "screening_t1" / f"{i:04d}_color.png").rename(tmp_path / "screening_t1" / f"{i}_color.png")
+    for i in (0, 1):
+        (tmp_path / "screening_t1" / f"{i}_color.png").unlink()
+    rows = np.loadtxt(tmp_path / "screening_t1" / "pose.txt", delimiter=",")
+    for lines in (rows, rows.reshape(-1, 4, 4).transpose(0, 2, 1).reshape(-1, 16)):
+        np.savetxt(tmp_path / "screening_t1" / "pose.txt", lines, delimiter=",")
+        read = open_sequence(tmp_path / "screening_t1")
+        assert read.names == ["0002_color", "0003_color", "0004_color", "0005_color"]
+        for found, frame in zip(read, given[2:], strict=True):
+            np.testing.assert_allclose(found.true_world_from_cam, frame.true_world_from_cam, atol=1e-6)
+            assert found.true_distance is None and found.camera == LENS
+            assert np.abs(found.image - frame.image).max() < 1e-6
+
+
 def test_half_the_size_is_read_with_half_the_camera(tmp_path):
     write_c3vd(colon(0, 1, 6.0, lens("c3vd", 675, 540).resized(50, 40)).frames, tmp_path / "seq")
     (frame,) = read_c3vd(tmp_path / "seq")

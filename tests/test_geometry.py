@@ -9,6 +9,7 @@ import torch
 from scenes import C3VD, ENDOMAPPER, LENSES, PINHOLE, cylinder, ray_tensors, slanted_plane, sphere
 
 from lightdepth.camera import Pinhole
+from lightdepth.datasets import read_c3vd
 from lightdepth.decline import masked_blur
 from lightdepth.geometry import depth_from_distance, distance_from_depth, normals_from_distance, pixel_solid_angle
 
@@ -152,6 +153,8 @@ def test_real_c3vd_depth_is_along_the_axis_and_its_normals_are_the_published_one
         error = angles(normals_from_distance(smooth, rays), normals / normals.norm(dim=1, keepdim=True))
         return float(error[interior(known)].median())
 
+    (read,) = read_c3vd(folder)
+    np.testing.assert_allclose(read.true_distance * C3VD.rays()[0][..., 2], (depth * known)[0, 0], atol=1e-4)
     one = torch.ones_like(depth)
     assert median_error(torch.where(known, distance_from_depth(depth, rays[:, 2:]), one)) < 3.5
     assert median_error(torch.where(known, depth, one)) > 15
