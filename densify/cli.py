@@ -150,7 +150,7 @@ def evaluate(
         truth: sequence with true depth, and for surfaces with true poses
         output: folder for the metrics; evaluation/ in the run when left out
         join: JSON with the Sim(3) between two submaps (first, second, scale, rotation, translation): their gap
-        format: of the truth: folder, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking when left out
+        format: the truth's: folder, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking when left out
         camera: calibration file that wins over the truth's
         mask: image, white where tissue shows
         max_depth_mm: true depth beyond this takes no part

@@ -91,7 +91,7 @@ def _camera_doubts(camera: CameraModel) -> list[str]:
 def _light_doubts(light: PhotometricCalibration) -> list[str]:
     found = []
     if not 1 <= light.gamma <= 3:
-        found.append(f"the light's gamma is {light.gamma:g}; a camera's is between 1 and 3, and is 1/gamma meant?")
+        found.append(f"the light's gamma is {light.gamma:g}; a camera's is between 1 and 3: was 1/gamma written?")
     away = float(np.linalg.norm(light.position_mm))
     if away > 100:
         found.append(
@@ -171,7 +171,10 @@ def comb_ratio(image: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to take a file's poses and distances: what is done to a pose (4, 4) and to a distance along z/r = c."""
+    """One way to take a file's poses and distances.
+
+    pose: of a pose (4, 4), the one meant; distance: of distances (n,) and their rays' z (n,), the distances meant.
+    """
 
     pose: Callable[[np.ndarray], np.ndarray]
     distance: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -274,7 +277,7 @@ def fitting_reading(frames: Sequence[Frame]) -> Fit | None:
 
 
 def _error(frames: Sequence[Frame], reading: Reading) -> float:
-    """Median relative error over pairs of frames; the least of the pairs that see the same surface, else infinity."""
+    """Median over the pairs of frames that see the same surface, of their median relative errors; else infinity."""
     pairs = [(a, b) for i, a in enumerate(frames) for b in frames[i + 1 :]]
     errors = [e for a, b in pairs for e in (_pair_error(a, b, reading),) if e is not None]
     return float(np.median(errors)) if errors else float("inf")

@@ -153,7 +153,8 @@ def _read_sequence(
                 true_world_from_cam=reading(poses[number]) @ np.linalg.inv(view_from_left) if number in poses else None,
             )
 
-        return lru_cache(3)(load)  # the frames just looked at are asked for again
+        # The frames just looked at are asked for again, and an archive would start anew
+        return load if sampled is None else lru_cache(3)(load)
 
     sequence = FrameSequence(names, loader(np.linalg.inv), str(path), sampled)
     if not poses or points is None:
