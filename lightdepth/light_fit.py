@@ -24,6 +24,7 @@ from lightdepth.datasets import FrameSequence
 from lightdepth.decline import BLUR, V_FLOOR, masked_blur
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, check_image_size, to_batch
+from lightdepth.maps.checks import check_shared_frames
 from lightdepth.observations import observed_distances
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness
 from lightdepth.predict import ConstantModel, DeclineModel, working_size
@@ -167,6 +168,7 @@ def fit_on_map(
     The judge (the closed form unless given) predicts the withheld keyframes with each light. Raises InputError when
     fewer than four keyframes have `least` usable points.
     """
+    check_shared_frames(sparse_map, frames)
     views, samples = [], []
     for view in map_views(frames, sparse_map, camera):
         found = samples_of(view)

@@ -134,7 +134,7 @@ def check_rigid(transform: np.ndarray, what: str) -> None:
     if transform.shape != (4, 4):
         raise InputError(f"{what}: pose of shape {transform.shape}; expected (4, 4)")
     if not np.isfinite(transform).all():
-        raise InputError(f"{what}: the pose has NaN or infinite numbers")
+        raise InputError(f"{what}: the pose has NaN or infinite numbers; expected a rotation and a translation")
     rotation = transform[:3, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if off > 1e-3 or np.linalg.det(rotation) < 0:

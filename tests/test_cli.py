@@ -231,7 +231,10 @@ BAD_INPUT = {
         ["densify", "DATA", "--map", "SLAM", "--mm_per_unit", "-1", "--checkpoint", "decline"],
         "positive number",
     ),
-    "light": (["predict", "DATA", "--light", "gama=2", "--checkpoint", "decline"], "gama: Extra inputs"),
+    "light": (
+        ["predict", "DATA", "--light", "gama=2", "--checkpoint", "decline"],
+        "gama is not known (is gamma meant?)",
+    ),
     "mask": (["predict", "DATA", "--mask", "NOWHERE", "--checkpoint", "decline"], "nowhere: no such mask"),
     "frames": (["synth", "--frames", "0"], "--frames 0; expected at least 1"),
     "too few frames": (["synth", "--frames", "2", "--size", "[24, 20]"], "render more frames"),
@@ -393,7 +396,7 @@ def test_a_map_of_other_frames_is_3_and_says_which_are_missing(frames, data, tmp
     argv = ["--map", data / "slam", "--checkpoint", "decline"]
     assert lightdepth("densify", tmp_path / "seq", *argv, "-o", tmp_path / "out") == 3
     said = capsys.readouterr().err
-    assert "no keyframe of any map could be aligned" in said and "no frame number 0 in" in said
+    assert "frames 900 to" in said and "none in common" in said and "frame_offset" in said
     assert left_in(tmp_path) == ["seq"]
 
 

@@ -125,10 +125,10 @@ def spoil(folder: Path, how: str) -> None:
         image.write_bytes(image.read_bytes()[:200])
     elif how == "no camera":
         (folder / "camera.json").unlink()
-    elif how == "half size":
-        cv2.imwrite(str(image), np.zeros((40, 48, 3), np.uint8))
-    elif how == "cropped":
-        cv2.imwrite(str(image), np.zeros((80, 64, 3), np.uint8))
+    elif how in ("half size", "cropped", "one of another size"):
+        for file in image.parent.iterdir() if how != "one of another size" else [image]:
+            cv2.imwrite(str(file), np.zeros((80, 64, 3) if how == "cropped" else (40, 48, 3), np.uint8))
+        (folder / "mask.png").unlink()
     elif how == "a pose too few":
         poses.write_text("\n".join(poses.read_text().splitlines()[:2]) + "\n")
     elif how == "NaN":
@@ -157,15 +157,16 @@ def spoil(folder: Path, how: str) -> None:
 SPOILED = {
     "truncated": r"000001\.png: not a readable image",
     "no camera": r"seq: no camera\.json; give --camera FILE",
-    "half size": r"000001.*48x40.*96x80.*ratio 0\.5.*multiply fx, fy, cx, cy by 0\.5.*width 48, height 40",
-    "cropped": r"000001.*64x80.*96x80.*cropped or padded",
+    "one of another size": r"000001\.png: is 48x40, but 000000\.png is 96x80 \(1 of 3 images differ\)",
+    "half size": r"00000.*48x40.*96x80.*ratio 0\.5.*multiply fx, fy, cx, cy by 0\.5.*width 48, height 40",
+    "cropped": r"00000.*64x80.*96x80.*cropped or padded",
     "a pose too few": r"poses\.tum: 2 poses for 3 frames",
     "NaN": r"poses\.tum: line 2 has NaN",
     "seven columns": r"poses\.tum: 7 columns; a TUM trajectory has 8",
     "words": r"poses\.tum: not a TUM trajectory",
     "zero quaternion": r"poses\.tum: line 2.*quaternion",
     "number twice": "seq: .*1 and .*1 have the same number",
-    "empty": "seq: no images with a number in their names",
+    "empty": "seq: no images with a number in their names .found camera.json",
     "truth of another size": "000001: true distance is 5x5, the image 96x80",
     "truth truncated": r"000001\.tiff: not a readable image",
 }

@@ -101,7 +101,7 @@ SPOILED_V2 = {
     "eight bits": r"0001_depth\.tiff: uint8.*one channel of 16 bits",
     "depth of another size": r"0001_depth\.tiff: depth is 50x40, the image 100x80",
     "cropped": "seq: images are 80x80; C3VD's camera is for 1350x1080.*--camera FILE",
-    "another size": "0001: the image is 50x40, the camera 100x80",
+    "another size": r"0001\.png: is 50x40, but 0000\.png is 100x80",
     "number twice": r"rgb: 0001\.png and 1\.png have the same number",
     "a pose too few": r"pose\.txt: 2 poses, but there is a frame 2",
 }
@@ -295,7 +295,7 @@ SPOILED_HAMLYN = {
     "depth of another size": r"0000000001\.png: depth is 48x40, the image 96x80",
     "no intrinsics": r"rectified01: no intrinsics\.txt.*--camera FILE",
     "number twice": r"image01: 0000000001\.jpg and 1\.jpg have the same number",
-    "another size": "0000000001: the image is 48x40, the camera 96x80",
+    "another size": r"0000000001\.jpg: is 48x40, but 0000000000\.jpg is 96x80",
 }
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
@@ -13,6 +14,8 @@ from lightdepth.calibration.plain_text import write_text
 from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.errors import InputError
 from lightdepth.photometry import PhotometricCalibration
+
+_Schema = TypeVar("_Schema", bound=BaseModel)
 
 
 def _pixel_center(value: float) -> float:
@@ -51,19 +54,48 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: not valid JSON ({error})") from error
 
 
-def _checked(schema: type[BaseModel], data: Any, where: str) -> Any:
+def checked_fields(schema: type[_Schema], data: Any, where: str) -> _Schema:
+    """The fields of a file as its schema has them; `where` names the file in the InputError of what does not fit."""
     try:
         return schema.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
-        field = ".".join(map(str, first["loc"])) or "the file"
-        raise InputError(f"{where}: {field}: {first['msg']}") from error
+        *above, last = [str(part) for part in first["loc"] if part != "[key]"] or ["the file"]
+        field = ".".join([*above, last])
+        known = _known(schema, above)
+        expected = f"; expected {', '.join(known)}" if known else ""
+        if first["type"] == "missing":
+            message = f"{field} missing{expected}"
+        elif first["type"] == "extra_forbidden":
+            close = get_close_matches(last, known, 1, cutoff=0.75)
+            message = f"{field} is not known{f' (is {close[0]} meant?)' if close else ''}{expected}"
+        else:
+            message = f"{field}: {first['msg'].removeprefix('Value error, ')}"
+            found = first["input"]
+            if isinstance(found, str | int | float | bool | None) and repr(found) not in message:
+                message += f"; found {found!r}"
+        raise InputError(f"{where}: {message}") from error
+
+
+def _known(schema: type[BaseModel], above: list[str]) -> list[str]:
+    """The fields below the keys `above`; none where these lead to something else than a schema."""
+    for key in above:
+        inner = schema.model_fields[key].annotation
+        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+            return []
+        schema = inner
+    return list(schema.model_fields)
 
 
 def read_camera_json(path: Path) -> CameraModel:
     """camera.json -> camera, brought to our pixel convention."""
-    found = _checked(_CameraFile, read_json(path), str(path))
-    camera = camera_from_params(found.model, found.width, found.height, found.params, str(path))
+    return camera_from_fields(read_json(path), str(path))
+
+
+def camera_from_fields(data: Any, where: str) -> CameraModel:
+    """The camera of camera.json's fields, wherever they are written; `where` names the place in errors."""
+    found = checked_fields(_CameraFile, data, where)
+    camera = camera_from_params(found.model, found.width, found.height, found.params, where)
     return camera.with_pixel_center(found.pixel_center)
 
 
@@ -87,7 +119,7 @@ def read_light_json(path: Path) -> PhotometricCalibration:
 
 
 def _light(data: Any, where: str) -> PhotometricCalibration:
-    values = _checked(_LightFile, data, where).model_dump()
+    values = checked_fields(_LightFile, data, where).model_dump()
     try:
         return PhotometricCalibration(**values)
     except InputError as error:

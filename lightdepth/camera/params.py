@@ -44,7 +44,8 @@ def camera_from_params(model: str, width: int, height: int, params: list[float],
         known = ", ".join([*CAMERA_MODELS, *_COLMAP_SPECIAL])
         raise InputError(f"{where}: unknown camera model {model!r}; expected one of {known}")
     if len(params) != count:
-        raise InputError(f"{where}: {model} has {count} parameters, found {len(params)}")
+        names = f"; expected {' '.join(f.name for f in fields(cls)[2:])}" if model in CAMERA_MODELS else ""
+        raise InputError(f"{where}: {model} has {count} parameters, found {len(params)}{names}")
     try:
         return build(int(width), int(height), *map(float, params))
     except InputError as error:

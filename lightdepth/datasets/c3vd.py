@@ -24,7 +24,16 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import FrameSequence, along_ray, found_mask, numbered_files, read_code, read_image
+from lightdepth.datasets.sequence import (
+    FrameSequence,
+    along_ray,
+    check_one_size,
+    found_mask,
+    numbered_files,
+    read_code,
+    read_image,
+    warn_of_gaps,
+)
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
@@ -108,9 +117,14 @@ def read_c3vd(
     colour = _colour(path, tree)
     depth = numbered_files(path / tree.depth, r"(\d+)_depth\.tiff")
     numbers = sorted(colour)
+    check_one_size([colour[n] for n in numbers])
+    warn_of_gaps(path, numbers, depth)
     poses = _read_poses(path / "pose.txt") if (path / "pose.txt").is_file() else None
     if poses is not None and numbers[-1] >= len(poses):
-        raise InputError(f"{path / 'pose.txt'}: {len(poses)} poses, but there is a frame {numbers[-1]}")
+        raise InputError(
+            f"{path / 'pose.txt'}: {len(poses)} poses, but there is a frame {numbers[-1]}; expected a line for each "
+            "frame, from frame 0"
+        )
     if camera is None:
         height, width = read_image(colour[numbers[0]]).shape[:2]
         whole = tree.camera
@@ -184,7 +198,7 @@ def _read_poses(path: Path) -> np.ndarray:
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a C3VD pose file, 16 numbers a line separated by commas ({error})") from error
     if rows.shape[1] != 16:
-        raise InputError(f"{path}: {rows.shape[1]} numbers a line; expected 16")
+        raise InputError(f"{path}: {rows.shape[1]} numbers a line; expected 16, a camera-to-world matrix")
     matrices = rows.reshape(-1, 4, 4)
     last = np.array([0, 0, 0, 1.0])
     if np.allclose(matrices[:, 3], last, atol=1e-4):

@@ -24,7 +24,15 @@ import numpy as np
 from lightdepth.calibration import read_camera, read_json, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import FrameSequence, found_mask, list_images, read_image, read_mask
+from lightdepth.datasets.sequence import (
+    FrameSequence,
+    check_one_size,
+    found_mask,
+    list_images,
+    no_images,
+    read_image,
+    read_mask,
+)
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
@@ -79,12 +87,13 @@ def read_endomapper(
             height, width = read_image(images[0]).shape[:2]
             camera = _at_size(own, width, height, images[0].name)
     if not images:
-        raise InputError(f"{image_folder(path)}: no images with a number in their names; expected out1.png, out2.png")
+        raise InputError(f"{image_folder(path)}: {no_images(image_folder(path))}; expected out1.png, out2.png")
     if frame_number(images[0].name) < 1:
         raise InputError(
             f"{images[0]}: number 0, but EndoMapper counts frames from 1 (out1.png is the first of the video); "
             "extract them so, or read them with --format folder"
         )
+    check_one_size(images)
     height, width = read_image(images[0]).shape[:2]
     if camera is None:
         file = _calibration(path, _GEOMETRY)

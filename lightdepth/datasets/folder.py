@@ -15,9 +15,20 @@ from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.sequence import FrameSequence, list_images, read_image, read_mask, read_raw
+from lightdepth.datasets.sequence import (
+    FrameSequence,
+    check_one_size,
+    image_size,
+    legible,
+    list_images,
+    no_images,
+    read_image,
+    read_mask,
+    read_raw,
+    warn_of_gaps,
+)
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
 
 
@@ -30,22 +41,31 @@ def read_folder(
     """Frames of a folder. What is given here wins over the files in it; without any camera it is refused."""
     images = list_images(path / "frames" if (path / "frames").is_dir() else path)
     if not images:
-        raise InputError(f"{path}: no images with a number in their names; expected frames such as 000123.png")
+        raise InputError(f"{path}: {no_images(path)}; expected frames such as 000123.png")
+    check_one_size(images)
+    first = legible(images)
     if camera is None:
         if not (path / "camera.json").is_file():
+            above = path.resolve().parent
+            if (above / "camera.json").is_file():
+                raise InputError(f"{path}: no camera.json, but {above} has one; give the sequence's folder, {above}")
             raise InputError(
                 f"{path}: no camera.json; give --camera FILE "
                 '({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), or a map that has one'
             )
         camera = read_camera(path / "camera.json")
+        if first is not None:
+            check_image_size(str(first), *image_size(first), camera)
     if light is None:
         light = read_light(path / "light.json") if (path / "light.json").is_file() else PhotometricCalibration()
     if mask is None and (path / "mask.png").is_file():
-        mask = read_mask(path / "mask.png")
+        mask = read_mask(path / "mask.png", first)
     truth = path / "truth"
     times, poses = read_tum(truth / "poses.tum") if (truth / "poses.tum").is_file() else (None, None)
     if poses is not None and len(poses) != len(images):
         raise InputError(f"{truth / 'poses.tum'}: {len(poses)} poses for {len(images)} frames; expected one for each")
+    known = {frame_number(file.name) for file in (truth / "distance").glob("*.tiff")}
+    warn_of_gaps(path, [frame_number(image.name) for image in images], known)
 
     def load(i: int) -> Frame:
         distance = truth / "distance" / f"{images[i].stem}.tiff"
@@ -110,10 +130,13 @@ def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if rows.shape[1] != 8:
         raise InputError(f"{path}: {rows.shape[1]} columns; a TUM trajectory has 8: t tx ty tz qx qy qz qw")
     if not np.isfinite(rows).all():
-        raise InputError(f"{path}: line {int((~np.isfinite(rows)).any(1).argmax()) + 1} has NaN or infinite numbers")
+        line = int((~np.isfinite(rows)).any(1).argmax()) + 1
+        raise InputError(f"{path}: line {line} has NaN or infinite numbers; expected a pose for each frame")
     length = np.linalg.norm(rows[:, 4:], axis=1)
     if (length < 1e-6).any():
-        raise InputError(f"{path}: line {int((length < 1e-6).argmax()) + 1}: the quaternion qx qy qz qw is zero")
+        raise InputError(
+            f"{path}: line {int((length < 1e-6).argmax()) + 1}: the quaternion qx qy qz qw is zero; expected length 1"
+        )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]

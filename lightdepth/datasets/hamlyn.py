@@ -24,10 +24,12 @@ from lightdepth.datasets.folder import to_bgr8
 from lightdepth.datasets.sequence import (
     FrameSequence,
     along_ray,
+    check_one_size,
     found_mask,
     numbered_files,
     read_code,
     read_image,
+    warn_of_gaps,
 )
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
@@ -71,6 +73,9 @@ def read_hamlyn(
         )
     colour, depth = numbered_files(path / tree.colour, _COLOUR), numbered_files(path / tree.depth, _DEPTH)
     numbers = sorted(colour)
+    check_one_size([colour[n] for n in numbers])
+    if tree.measured:
+        warn_of_gaps(path, numbers, depth)
     if camera is None:
         file = path / "intrinsics.txt"
         if not file.is_file():

@@ -14,12 +14,23 @@ from lightdepth.datasets.endoslam import is_endoslam, read_endoslam
 from lightdepth.datasets.folder import read_folder
 from lightdepth.datasets.hamlyn import is_hamlyn, read_hamlyn
 from lightdepth.datasets.scared import is_scared, read_scared
-from lightdepth.datasets.sequence import FrameSequence, list_images, read_image, read_mask
+from lightdepth.datasets.sequence import FrameSequence, image_size, legible, list_images, read_image, read_mask
 from lightdepth.datasets.simcol import is_simcol, read_simcol
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 
 FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "scared", "endoslam", "endomapper")
+
+_LOOKS = {
+    "c3vd": is_c3vd,
+    "simcol": is_simcol,
+    "hamlyn": is_hamlyn,
+    "scared": is_scared,
+    "endoslam": is_endoslam,
+    "endomapper": is_endomapper,
+}
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".ts", ".wmv", ".m4v", ".webm")
+_DEEP, _MANY = 3, 200  # folders within which sequences are looked for, to name them, and entries of each
 
 
 def open_sequence(
@@ -36,36 +47,45 @@ def open_sequence(
     `map_camera` serves where neither a file nor the format gives a camera, and wins over EndoMapper's calibration:
     its own maps were made with other numbers. `check_sequence` says what is doubtful.
     """
-    return check_sequence(_open(path, format, camera, light, mask, map_camera))
+    path = Path(path)
+    if not path.is_dir() and not _is_cluster(path, format):
+        video = path.suffix.lower() in _VIDEOS
+        found = "is a video" if video else "is a file" if path.is_file() else "does not exist"
+        cure = f"; extract its frames: ffmpeg -i {path.name} frames/%06d.png" if video else ""
+        raise InputError(f"{path}: {found}; expected a folder of frames{cure}")
+    try:
+        return check_sequence(_open(path, format, camera, light, mask, map_camera))
+    except InputError as error:
+        cure = ""
+        if path.is_dir() and not _is_cluster(path, format):
+            cure = _other_format(path, format) if format is not None else _folders_below(path)
+        if not cure:
+            raise
+        raise InputError(f"{error}{cure}") from error
+    except OSError as error:
+        raise InputError(f"{error.filename or path}: cannot be read ({error.strerror or error})") from error
 
 
 def _open(
-    path: str | Path,
+    path: Path,
     format: str | None,
     camera: str | Path | None,
     light: str | Path | None,
     mask: str | Path | None,
     map_camera: CameraModel | None,
 ) -> FrameSequence:
-    path = Path(path)
-    if format in (None, "endomapper") and endomapper.cluster_of(path) is not None:
+    if _is_cluster(path, format):
         format = "endomapper"
-    elif not path.is_dir():
-        found = "is a file" if path.is_file() else "does not exist"
-        raise InputError(f"{path}: {found}; expected a folder of frames")
     if format is None:
-        looks = {
-            "c3vd": is_c3vd,
-            "simcol": is_simcol,
-            "hamlyn": is_hamlyn,
-            "scared": is_scared,
-            "endoslam": is_endoslam,
-            "endomapper": is_endomapper,
-        }
-        format = next((name for name, fits in looks.items() if fits(path)), "folder")
+        format = _looks_like(path) or "folder"
+    if format not in FORMATS:
+        raise InputError(f"format {format!r}; expected one of {', '.join(FORMATS)}")
     chosen_light = read_light(light) if light is not None else None
-    chosen_mask = read_mask(Path(mask)) if mask is not None else None
+    first = legible(list_images(_image_folder(path, format)))
+    chosen_mask = read_mask(Path(mask), first) if mask is not None else None
     chosen = _read_camera(Path(camera), _image_folder(path, format)) if camera is not None else None
+    if chosen is not None and first is not None:
+        check_image_size(str(first), *image_size(first), chosen)
     if format == "c3vd":
         return read_c3vd(path, chosen, chosen_light, chosen_mask)
     if format == "simcol":
@@ -86,11 +106,45 @@ def _open(
         if chosen is None and map_camera is not None:
             chosen = _at_size_of_images(map_camera, _image_folder(path, format))
         return read_endomapper(path, chosen, chosen_light, chosen_mask)
-    if format == "folder":
-        if chosen is None and map_camera is not None and not (path / "camera.json").is_file():
-            chosen = _at_size_of_images(map_camera, _image_folder(path, format))
-        return read_folder(path, chosen, chosen_light, chosen_mask)
-    raise InputError(f"format {format!r}; expected one of {', '.join(FORMATS)}")
+    if chosen is None and map_camera is not None and not (path / "camera.json").is_file():
+        chosen = _at_size_of_images(map_camera, _image_folder(path, format))
+    return read_folder(path, chosen, chosen_light, chosen_mask)
+
+
+def _is_cluster(path: Path, format: str | None) -> bool:
+    """Whether the path is of a COLMAP cluster of EndoMapper's, which may be a file."""
+    return format in (None, "endomapper") and endomapper.cluster_of(path) is not None
+
+
+def _looks_like(path: Path) -> str | None:
+    """The data set whose files a folder has."""
+    return next((name for name, fits in _LOOKS.items() if fits(path)), None)
+
+
+def _other_format(path: Path, format: str) -> str:
+    """What to try where the format that was named does not fit."""
+    other = _looks_like(path)
+    return "" if other is None or other == format else f". By its files it looks like --format {other}"
+
+
+def _folders_below(path: Path) -> str:
+    """What to give where a folder holds sequences, and is none."""
+    if _is_sequence(path):
+        return ""
+    found: list[Path] = []
+    level = [path]
+    for _ in range(_DEEP):
+        below = [p for folder in level for p in sorted(folder.iterdir())[:_MANY] if p.is_dir() and p.name != "truth"]
+        found += [p for p in below if _is_sequence(p)]
+        level = [p for p in below if p not in found]
+    if not found:
+        return ""
+    names = ", ".join(str(p) for p in found[:3]) + (f" and {len(found) - 3} more" if len(found) > 3 else "")
+    return f". It holds folders of frames: give one of them ({names})"
+
+
+def _is_sequence(path: Path) -> bool:
+    return _looks_like(path) is not None or _first_image(_image_folder(path, "folder")) is not None
 
 
 def _image_folder(path: Path, format: str) -> Path:
@@ -123,8 +177,12 @@ def _at_size_of_images(camera: CameraModel, folder: Path) -> CameraModel:
 
 def _size_of_images(folder: Path) -> tuple[int, int] | None:
     """Width and height of the first image, where there is one."""
-    images = list_images(folder)
-    if not images:
+    image = _first_image(folder)
+    if image is None:
         return None
-    height, width = read_image(images[0]).shape[:2]
+    height, width = read_image(image).shape[:2]
     return width, height
+
+
+def _first_image(folder: Path) -> Path | None:
+    return next(iter(list_images(folder)), None)

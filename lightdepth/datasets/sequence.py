@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+import warnings
+from collections import Counter
+from collections.abc import Callable, Container, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import overload
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, frame_number
@@ -39,7 +43,10 @@ class FrameSequence(Sequence[Frame]):
         twice = {n for n in self.numbers if self.numbers.count(n) > 1} if len(set(self.numbers)) < len(names) else set()
         if twice:
             same = [name for name, n in zip(self.names, self.numbers, strict=True) if n == min(twice)]
-            raise InputError(f"{source}: {' and '.join(same)} have the same number; frames are told apart by it")
+            raise InputError(
+                f"{source}: {' and '.join(same)} have the same number; frames are told apart by it: rename or "
+                "remove one"
+            )
 
     def __len__(self) -> int:
         return len(self.names)
@@ -50,9 +57,12 @@ class FrameSequence(Sequence[Frame]):
     def __getitem__(self, index: slice) -> FrameSequence: ...
     def __getitem__(self, index: int | slice) -> Frame | FrameSequence:
         if isinstance(index, slice):
-            rows = range(len(self))[index]
-            return FrameSequence([self.names[i] for i in rows], lambda i: self._load(rows[i]), self.source)
+            return self.at(range(len(self))[index])
         return self._load(range(len(self))[index])
+
+    def at(self, rows: Sequence[int]) -> FrameSequence:
+        """The frames at these rows, in this order."""
+        return FrameSequence([self.names[i] for i in rows], lambda i: self._load(rows[i]), self.source)
 
     def image_size(self) -> tuple[int, int]:
         """Width and height of the frames; reads the first."""
@@ -70,6 +80,15 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(images, key=lambda p: (frame_number(p.name), p.name))
 
 
+def no_images(folder: Path) -> str:
+    """What a folder without frames holds instead, for messages."""
+    names = sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())
+    if not names:
+        return "the folder is empty"
+    found = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return f"no images with a number in their names (found {found})"
+
+
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     """Files whose whole name matches `pattern`, by the integer in its first group; 12 and 0012 are the same."""
     found: dict[int, Path] = {}
@@ -85,27 +104,39 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
 
 def read_image(path: Path) -> np.ndarray:
     """(H, W, 3) float32 RGB in [0, 1]. 8- and 16-bit files alike."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such image")
-    data = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)
-    if data is None:
-        raise InputError(f"{path}: not a readable image (truncated, or not an image at all)")
+    data = decode(read_bytes(path, "image"), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR, str(path))
     top = 65535.0 if data.dtype == np.uint16 else 255.0
     return cv2.cvtColor(data, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(top)
 
 
+def read_bytes(path: Path, what: str = "file") -> bytes:
+    """The file's bytes, or InputError where it is not there or cannot be read."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such {what}")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def decode(data: bytes, flags: int, where: str) -> np.ndarray:
+    """cv2's image in a file's bytes. imdecode refuses a truncated JPEG, whose rest imread would paint grey."""
+    if not data:
+        raise InputError(f"{where}: not a readable image (the file is empty, 0 bytes)")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise InputError(f"{where}: not a readable image (truncated, or not an image at all)")
+    return image
+
+
 def read_raw(path: Path) -> np.ndarray:
     """The file's own numbers, channels in the file's order (cv2's reversal undone)."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    return decode_raw(path.read_bytes(), str(path))
+    return decode_raw(read_bytes(path), str(path))
 
 
 def decode_raw(data: bytes, where: str) -> np.ndarray:
     """`read_raw` of a file's bytes; `where` names them in errors."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    if image is None:
-        raise InputError(f"{where}: not a readable image (truncated, or not an image at all)")
+    image = decode(data, cv2.IMREAD_UNCHANGED, where)
     return image if image.ndim == 2 else image[..., ::-1]
 
 
@@ -116,7 +147,8 @@ def read_code(path: Path, ray_z: np.ndarray, whose: str) -> np.ndarray:
         raise InputError(f"{path}: {code.dtype} of shape {code.shape}; {whose}'s depth is one channel of 16 bits")
     if code.shape != ray_z.shape:
         raise InputError(
-            f"{path}: depth is {code.shape[1]}x{code.shape[0]}, the image {ray_z.shape[1]}x{ray_z.shape[0]}"
+            f"{path}: depth is {code.shape[1]}x{code.shape[0]}, the image {ray_z.shape[1]}x{ray_z.shape[0]}; expected "
+            "the same size"
         )
     return code
 
@@ -127,8 +159,9 @@ def along_ray(depth: np.ndarray, known: np.ndarray, ray_z: np.ndarray) -> np.nda
     return np.where(known, depth / np.where(known, ray_z, 1), 0).astype(np.float32)
 
 
-def read_mask(path: Path) -> np.ndarray:
-    """(H, W) bool, True where tissue shows. Files come in both polarities: the centre of the image decides."""
+def read_mask(path: Path, image: Path | None = None) -> np.ndarray:
+    """(H, W) bool, True where tissue shows, of the size of the image where one is given. Files come in both polarities:
+    the centre of the image decides."""
     if not path.is_file():
         raise InputError(f"{path}: no such mask")
     grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -136,11 +169,67 @@ def read_mask(path: Path) -> np.ndarray:
         raise InputError(f"{path}: not a readable mask; expected an image, white where tissue shows")
     mask = grey > 127
     height, width = mask.shape
+    if image is not None and image_size(image) != (width, height):
+        wide, high = image_size(image)
+        raise InputError(
+            f"{path}: the mask is {width}x{height}, but {image.name} is {wide}x{high}; expected a mask of the images' "
+            "size"
+        )
     centre = mask[int(height * 0.45) : int(height * 0.55) + 1, int(width * 0.45) : int(width * 0.55) + 1]
     mask = mask if centre.mean() >= 0.5 else ~mask
     if mask.all() and not (grey > 127).any():
         raise InputError(f"{path}: the mask is black everywhere; expected white where tissue shows")
     return mask
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height, from the file's header alone where it has a legible one."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except OSError:
+        height, width = read_image(path).shape[:2]
+        return width, height
+
+
+def legible(images: Sequence[Path]) -> Path | None:
+    """The first image whose size can be told: a broken one is refused when it is read, and the others are not."""
+    for image in images:
+        with suppress(InputError):
+            image_size(image)
+            return image
+    return None
+
+
+def check_one_size(images: Sequence[Path]) -> None:
+    """Raises InputError, naming an odd one, when images of one sequence differ in size. Of many, some hundred are
+    looked at: the others are refused when they are read."""
+    step = max(1, len(images) // 256)
+    sizes: dict[Path, tuple[int, int]] = {}
+    for image in [*images[::step], images[-1]]:
+        with suppress(InputError):  # an image that cannot be read is refused when it is
+            sizes[image] = image_size(image)
+    counts = Counter(sizes.values())
+    if len(counts) > 1:
+        usual = counts.most_common(1)[0][0]
+        odd = [image for image, size in sizes.items() if size != usual]
+        example = next(image for image, size in sizes.items() if size == usual)
+        width, height = sizes[odd[0]]
+        raise InputError(
+            f"{odd[0]}: is {width}x{height}, but {example.name} is {usual[0]}x{usual[1]} ({len(odd)} of {len(sizes)} "
+            "images differ); expected one size in a sequence: sort them into folders by size"
+        )
+
+
+def warn_of_gaps(source: Path, numbers: Sequence[int], known: Container[int]) -> None:
+    """Warns of frames without the depth that others have."""
+    without = [number for number in numbers if number not in known]
+    if 0 < len(without) < len(numbers):
+        warnings.warn(
+            f"{source}: no depth for {len(without)} of {len(numbers)} frames, the first is frame {without[0]}; they "
+            "have no truth. Is the data set there whole?",
+            stacklevel=4,
+        )
 
 
 def found_mask(images: Sequence[Path], count: int = 8) -> np.ndarray:

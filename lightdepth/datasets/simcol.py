@@ -20,7 +20,15 @@ from scipy.spatial.transform import Rotation
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import FrameSequence, along_ray, numbered_files, read_code, read_image
+from lightdepth.datasets.sequence import (
+    FrameSequence,
+    along_ray,
+    check_one_size,
+    numbered_files,
+    read_code,
+    read_image,
+    warn_of_gaps,
+)
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
@@ -53,6 +61,8 @@ def read_simcol(
     numbers = sorted(colour)
     if not numbers:
         raise InputError(f"{path}: no FrameBuffer_NNNN.png in it; is it a Frames_ folder of SimCol3D?")
+    check_one_size([colour[n] for n in numbers])
+    warn_of_gaps(path, numbers, depth)
     if camera is None:
         file = camera_file(path)
         if file is None:

@@ -17,14 +17,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightdepth.camera import CameraModel
+from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.maps.convention import SIDECAR, distorted
-from lightdepth.sparse_map import Keyframe, Submap
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 MAX_MEDIAN_PX = 5.0
 _MIN_SHARE_IN_VIEW = 0.5
 _CELLS = 32  # of the z-buffer along the longer side of the image
 _HIDDEN = 1.5
+_HALF_A_PIXEL = 0.93  # real keypoints half a pixel off: 1.19 px for 1.36, and 1.16 for 1.33
 
 
 def reprojection(submap: Submap) -> tuple[float, float]:
@@ -50,8 +52,11 @@ def checked(submap: Submap, where: Path) -> Submap:
         return submap
     median, share = reprojection(submap)
     if median <= MAX_MEDIAN_PX and share >= _MIN_SHARE_IN_VIEW:
+        _whisper_half_a_pixel(submap, where, median)
         return submap
     found = f"{where}: median reprojection error {median:.1f} px, {share:.0%} of the observations in view"
+    if not share:
+        found = f"{where}: none of the keyframes has a point that it observed in its view"
     fits = {what: reprojection(other(submap)) for what, other in _OTHER_READINGS.items()}
     fits = {what: fit for what, fit in fits.items() if fit[0] < MAX_MEDIAN_PX and fit[1] >= _MIN_SHARE_IN_VIEW}
     if fits:
@@ -64,6 +69,36 @@ def checked(submap: Submap, where: Path) -> Submap:
         stacklevel=2,
     )
     return submap
+
+
+def _whisper_half_a_pixel(submap: Submap, where: Path, median: float) -> None:
+    """Warns when the keypoints fit clearly better half a pixel away, towards the other convention."""
+    for shift in (0.5, -0.5):
+        moved = reprojection(_each(lambda k, by=shift: replace(k, pixels=k.pixels + by))(submap))[0]  # type: ignore[misc]
+        if moved < _HALF_A_PIXEL * median:
+            warnings.warn(
+                f"{where}: median reprojection error {median:.2f} px, but {moved:.2f} px with {shift:+g} px on the "
+                "keypoints: do keypoints and principal point count pixels alike? The first pixel's centre must be at "
+                f'(0, 0) or at (0.5, 0.5) for both; which, "pixel_center" in {SIDECAR} says',
+                stacklevel=3,
+            )
+
+
+def check_shared_frames(sparse_map: SparseMap, frames: FrameSequence) -> None:
+    """Raises InputError when no keyframe of the map has the number of a frame; warns when most have not."""
+    mapped = sorted({k.number for submap in sparse_map.submaps for k in submap.keyframes})
+    shared = set(mapped) & set(frames.numbers)
+    if 2 * len(shared) > len(mapped):
+        return
+    first, last = min(frames.numbers), max(frames.numbers)
+    if mapped[-1] - mapped[0] > 100 * (last - first + 1):
+        cure = "are the map's times in milliseconds?"
+    else:
+        cure = f'if one counts from elsewhere, put "frame_offset" into {SIDECAR}'
+    found = f"{sparse_map.source}: keyframes {mapped[0]} to {mapped[-1]}, {frames.source}: frames {first} to {last}"
+    if not shared:
+        raise InputError(f"{found}, and none in common. They meet by the number in their names; {cure}")
+    warnings.warn(f"{found}; {len(shared)} of {len(mapped)} keyframes have a frame; {cure}", stacklevel=2)
 
 
 def seen_by_projection(submap: Submap, hide: bool = False) -> Submap:

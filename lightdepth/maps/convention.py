@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from lightdepth.calibration import read_json
+from lightdepth.calibration import checked_fields, read_json
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
 from lightdepth.frame import frame_number
@@ -85,11 +85,7 @@ def declared_convention(folder: Path, map_id: int, habit: MapConvention, roots: 
     path = next((p / SIDECAR for p in (folder, *roots) if (p / SIDECAR).is_file()), None)
     if path is None:
         return habit
-    try:
-        found = _Sidecar.model_validate(read_json(path))
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(f"{path}: {'.'.join(map(str, first['loc'])) or 'the file'}: {first['msg']}") from error
+    found = checked_fields(_Sidecar, read_json(path), str(path))
     if found.map_id is not None and path.parent == folder and found.map_id != map_id:
         raise InputError(f"{path}: map_id {found.map_id} in the folder of map {map_id}; correct one of the two")
     names = ("pixel_center", "pose_convention", "keypoints", "frame_offset", "fps")

@@ -28,6 +28,13 @@ def read_map(path: Path | str) -> SparseMap:
     Raises InputError saying what was found, where, and what would be right.
     """
     path = Path(path)
+    try:
+        return _read_map(path)
+    except OSError as error:
+        raise InputError(f"{error.filename or path}: cannot be read ({error.strerror or error})") from error
+
+
+def _read_map(path: Path) -> SparseMap:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; {_ACCEPTED}")
     if path.is_file() and path.suffix.lower() in (".msg", ".json"):
