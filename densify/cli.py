@@ -25,6 +25,7 @@ from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
 from lightdepth.light_fit import fit_on_map, with_light
 from lightdepth.maps import read_map
+from lightdepth.maps.checks import check_shared_frames
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.predict import DepthModel
 from lightdepth.progress import Progress
@@ -63,7 +64,7 @@ def densify(
         output: run folder to make
         map: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the frames
         checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
-        format: folder, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking when left out
+        format: folder, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if left out
         camera: calibration file; left out, the map's own camera, else the folder's
         light: light.json, photometric XML, or gamma=2.2,mu=0
         mask: image, white where tissue shows
@@ -121,7 +122,7 @@ def sparse(
     Args:
         data: folder of frames
         output: folder to make, with one COLMAP model per submap
-        format: folder, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking when left out
+        format: folder, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if left out
         camera: calibration file that wins over the folder's
         mask: image, white where tissue shows
         sfm: how frames are mapped
@@ -323,6 +324,7 @@ def _map_and_frames(
     sparse_map = read_map(map)
     map_camera = sparse_map.submaps[0].keyframes[0].camera
     frames = open_sequence(data, format, camera, light, mask, map_camera)
+    check_shared_frames(sparse_map, frames)
     width, height = frames.image_size()
     given = frames[0].camera if camera is not None else None
     if (map_camera.width, map_camera.height) != (width, height):

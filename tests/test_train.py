@@ -103,8 +103,8 @@ def test_training_frames_can_be_chosen_by_a_list(tmp_path):
 
 
 def test_the_last_tenth_of_a_sequence_is_held_out_unless_there_are_validation_sequences(tmp_path):
-    sequence = str(write_sequence(tmp_path / "seq", 20))
-    for val_sequences, counts in (([], {"train": 18, "val": 2}), ([sequence], {"train": 20, "val": 20})):
+    sequence, other = (str(write_sequence(tmp_path / name, 20)) for name in ("seq", "other"))
+    for val_sequences, counts in (([], {"train": 18, "val": 2}), ([other], {"train": 20, "val": 20})):
         data = FrameDataModule([sequence], val_sequences, size=(40, 32))
         data.setup()
         assert data.counts == counts
@@ -256,6 +256,22 @@ def test_training_on_a_folder_without_truth_reports_the_loss_alone(tmp_path):
     errors = json.loads((run / "run.json").read_text())["errors"]
     assert "loss" in errors and "abs_rel_median" not in errors
     assert list(json.loads((run / "run.json").read_text())["inputs"]) == [str(sequence)]
+
+
+def test_a_run_on_a_split_names_it_in_its_record_and_card(tmp_path):
+    for name in ("a", "b"):
+        write_sequence(tmp_path / "root" / name, 4)
+    split = tmp_path / "mine" / "splits" / "two.yaml"
+    split.parent.mkdir(parents=True)
+    split.write_text("parts: {train: [a], val: [b], test: [not there]}\n")
+    run = tmp_path / "run"
+    options = ["--data.split", str(split), "--data.root", str(tmp_path / "root"), "--data.size", "[40, 32]"]
+    options += ["--model.network.width", "4", "--trainer.max_steps", "2", "--trainer.accelerator", "cpu"]
+    assert train(["-o", str(run), *options]) == 0
+    record = json.loads((run / "run.json").read_text())
+    assert record["split"] == str(split) and record["frames"] == {"train": 4, "val": 4}
+    assert list(record["inputs"]) == [str(tmp_path / "root" / name) for name in "ab"]
+    assert "1 sequences of the split mine/two" in (run / "model.md").read_text()
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.name)

@@ -6,6 +6,7 @@ resumed run sees what an uninterrupted one would have seen.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, Sampler
 
+from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.datasets.splits import Chosen, Split, check_apart, folders, read_split
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, FrameBatch, to_batch
 from lightdepth.photometry import LightTerms, decode, encode
@@ -59,6 +62,8 @@ class FrameDataModule(pl.LightningDataModule):
     Args:
         sequences: folders to train on.
         val_sequences: folders to validate on; without any, the last tenth of each training sequence is held out.
+        split: a split file (data/*/splits/*.yaml) in place of both; its train and val are read, its test never is.
+        root: the folder that holds the split's sequences.
         frames: a file with one frame name a line; training takes only these.
         tube: synthetic colons.
         size: width and height of the images, pixels.
@@ -72,6 +77,8 @@ class FrameDataModule(pl.LightningDataModule):
         self,
         sequences: list[str] | None = None,
         val_sequences: list[str] | None = None,
+        split: str | None = None,
+        root: str | None = None,
         frames: str | None = None,
         tube: TubeData = _NO_TUBE,
         size: tuple[int, int] = (160, 128),
@@ -82,11 +89,19 @@ class FrameDataModule(pl.LightningDataModule):
     ) -> None:
         super().__init__()
         self.sequences, self.val_sequences = sequences or [], val_sequences or []
+        self.split, self.root = split, root
         self.frames, self.tube, self.seed = frames, tube, seed
         self.size, self.batch_size, self.num_workers = (int(size[0]), int(size[1])), batch_size, num_workers
         self.augment = augment
         if min(*self.size, batch_size) < 1:
             raise InputError(f"data: size {self.size}, batch_size {batch_size}; expected positive numbers")
+        if split is not None and (self.sequences or self.val_sequences):
+            raise InputError("data: a split and sequences; give --data.split FILE or --data.sequences, not both")
+        if (split is None) != (root is None):
+            raise InputError(
+                "data: a split and the root of its sequences go together: --data.split FILE --data.root DIR"
+            )
+        check_apart(self.sequences, self.val_sequences)
         self._train: ConcatDataset | None = None
         self._val: ConcatDataset | None = None
 
@@ -96,15 +111,16 @@ class FrameDataModule(pl.LightningDataModule):
         train: list[Dataset] = []
         val: list[Dataset] = []
         wanted = None if self.frames is None else read_frame_list(Path(self.frames))
-        for path in self.sequences:
-            chosen = _chosen(_open(path), wanted, path)
-            held_out = 0 if self.val_sequences else max(1, len(chosen) // 10)
+        to_train, to_validate = self._folders()
+        for path, of in to_train:
+            chosen = _chosen(_open(path, of), wanted, path)
+            held_out = 0 if to_validate else max(1, len(chosen) // 10)
             if len(chosen) <= held_out:
                 raise InputError(f"{path}: {len(chosen)} frame; expected at least two, one of them to validate on")
             train.append(_Frames(chosen[: len(chosen) - held_out], self.size))
             if held_out:
                 val.append(_Frames(chosen[-held_out:], self.size))
-        val += [_Frames(_chosen(_open(path), None, path), self.size) for path in self.val_sequences]
+        val += [_Frames(_chosen(_open(path, of), None, path), self.size) for path, of in to_validate]
         if self.tube.scenes + self.tube.val_scenes > 0:
             with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
                 first = self.seed * _SEEDS_APART
@@ -115,6 +131,22 @@ class FrameDataModule(pl.LightningDataModule):
         if not val:
             raise InputError("nothing to validate on; give --data.val_sequences FOLDER, or --data.tube.val_scenes N")
         self._train, self._val = ConcatDataset(train), ConcatDataset(val)
+
+    def _folders(self) -> list[list[tuple[str, Listed | None]]]:
+        """The folders to train and to validate on, with what a split says of each; a split's become the sequences."""
+        if self.split is None:
+            return [[(path, None) for path in paths] for paths in (self.sequences, self.val_sequences)]
+        split = read_split(Path(self.split))
+        if "train" not in split.parts:
+            raise InputError(f"{self.split}: no train in it; it is a split to test with, not to train with")
+        assert self.root is not None
+        found = folders(split, Path(self.root), ("train", "val"))
+        both: list[list[tuple[str, Listed | None]]] = [
+            [(str(folder), Listed(split, chosen)) for folder, chosen in found.get(part, [])]
+            for part in ("train", "val")
+        ]
+        self.sequences, self.val_sequences = ([path for path, _ in part] for part in both)
+        return both
 
     def _colons(self, first_seed: int, count: int, bar: Progress) -> list[Dataset]:
         made: list[Dataset] = []
@@ -221,13 +253,30 @@ def read_frame_list(path: Path) -> list[str]:
     return names
 
 
-def _open(path: str) -> Sequence[Frame]:
-    from lightdepth.datasets import open_sequence
+@dataclass(frozen=True)
+class Listed:
+    """An entry of a split."""
 
-    return open_sequence(Path(path))
+    split: Split
+    chosen: Chosen
 
 
-def _chosen(frames: Sequence[Frame], wanted: list[str] | None, path: str) -> list[Callable[[], Frame]]:
+def _open(path: str, of: Listed | None = None) -> FrameSequence:
+    if of is None:
+        return open_sequence(path)
+    info, expected = of.split.info, of.split.frame_count(of.chosen.name)
+    frames = open_sequence(path, None if info is None else info.format)
+    if expected is not None and len(frames) != expected:
+        warnings.warn(f"{path}: {len(frames)} frames; the data set has {expected}. Is it there whole?", stacklevel=2)
+    rows = [i for i, number in enumerate(frames.numbers) if of.chosen.takes(number)]
+    if not rows:
+        raise InputError(
+            f"{path}: no frame in {of.chosen}; its numbers are {frames.numbers[0]} to {frames.numbers[-1]}"
+        )
+    return frames.at(rows)
+
+
+def _chosen(frames: FrameSequence, wanted: list[str] | None, path: str) -> list[Callable[[], Frame]]:
     """Readers of the frames whose name (or its last part) is on the list, or of all."""
 
     def reader(index: int) -> Callable[[], Frame]:
@@ -235,7 +284,7 @@ def _chosen(frames: Sequence[Frame], wanted: list[str] | None, path: str) -> lis
 
     if wanted is None:
         return [reader(i) for i in range(len(frames))]
-    names = getattr(frames, "names", None) or [frame.name for frame in frames]
+    names = frames.names
     listed = {Path(name).stem for name in wanted}
     found = [reader(i) for i, name in enumerate(names) if Path(name).stem in listed]
     if not found:

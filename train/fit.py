@@ -107,6 +107,7 @@ def fit(
         record = {
             "seed": seed,
             "inputs": {path: input_hash(Path(path)) for path in [*data.sequences, *data.val_sequences]},
+            "split": data.split,
             "frames": data.counts,
             "steps": trainer.global_step,
             "resumed": resumed is not None,
@@ -182,7 +183,7 @@ def _card(
     model: LightDepth, data: FrameDataModule, trainer: pl.Trainer, seed: int, checkpoint: str, errors: dict[str, float]
 ) -> dict[str, Any]:
     tube = data.tube
-    parts = [f"{len(data.sequences)} sequences"] if data.sequences else []
+    parts = [f"{len(data.sequences)} sequences{_of_split(data.split)}"] if data.sequences else []
     if tube.scenes:
         parts.append(f"{tube.scenes} synthetic colons of {tube.frames} frames each")
     truth = "with true distance in the loss" if model.loss_config.supervised > 0 else "no truth in the loss"
@@ -198,6 +199,16 @@ def _card(
         "errors": errors,
         "version": versions().get("lightdepth", "not installed"),
     }
+
+
+def _of_split(split: str | None) -> str:
+    """The split's data set and name: comparisons are only between models of the same one."""
+    if split is None:
+        return ""
+    path = Path(split).resolve()
+    return (
+        f" of the split {path.parent.parent.name}/{path.stem}" if path.parent.name == "splits" else f" of {path.name}"
+    )
 
 
 def _echo(log: Path) -> Callable[[str], None]:
