@@ -64,7 +64,7 @@ def densify(
         output: run folder to make
         map: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the frames
         checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
-        format: folder, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if left out
+        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
         camera: calibration file; left out, the map's own camera, else the folder's
         light: light.json, photometric XML, or gamma=2.2,mu=0
         mask: image, white where tissue shows
@@ -122,7 +122,7 @@ def sparse(
     Args:
         data: folder of frames
         output: folder to make, with one COLMAP model per submap
-        format: folder, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if left out
+        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
         camera: calibration file that wins over the folder's
         mask: image, white where tissue shows
         sfm: how frames are mapped
@@ -151,7 +151,7 @@ def evaluate(
         truth: sequence with true depth, and for surfaces with true poses
         output: folder for the metrics; evaluation/ in the run when left out
         join: JSON with the Sim(3) between two submaps (first, second, scale, rotation, translation): their gap
-        format: the truth's: folder, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking when left out
+        format: the truth's: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found if left out
         camera: calibration file that wins over the truth's
         mask: image, white where tissue shows
         max_depth_mm: true depth beyond this takes no part

@@ -11,6 +11,7 @@ import ast
 import inspect
 import sys
 from importlib import metadata, util
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ ORDER = (
     "demo",
     "doctor",
     "synth",
+    "import",
     "calibrate-light",
     "convert-camera",
     "train",
@@ -89,7 +91,8 @@ def _parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
         parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run made there")
     declared: set[str | int] = {name for name in ("output", "overwrite") if name in parameters}
     parser.add_function_arguments(function, as_positional=True, sub_configs=True, skip=declared)
-    values = parser.instantiate(parser.parse_args([_underscored(a) for a in argv]))
+    flags = {name for name, parameter in parameters.items() if parameter.annotation in (bool, "bool")} - declared
+    values = parser.instantiate(parser.parse_args(_spelled_out([_underscored(a) for a in argv], flags)))
     return {name: values[name] for name in parameters}
 
 
@@ -99,6 +102,19 @@ def _underscored(argument: str) -> str:
         return argument
     name, sign, value = argument[2:].partition("=")
     return f"--{name.replace('-', '_')}{sign}{value}"
+
+
+def _spelled_out(argv: list[str], flags: set[str]) -> list[str]:
+    """--frames is --frames=true, --no_frames is --frames=false; `--frames false` stays as it is."""
+    spelled = []
+    for argument, following in pairwise([*argv, ""]):
+        name = argument.removeprefix("--")
+        if argument == f"--{name}" and name in flags and following not in ("true", "false"):
+            argument = f"--{name}=true"
+        elif argument == f"--no_{name.removeprefix('no_')}" and name.removeprefix("no_") in flags:
+            argument = f"--{name.removeprefix('no_')}=false"
+        spelled.append(argument)
+    return spelled
 
 
 def _sorted(commands: dict[str, metadata.EntryPoint]) -> list[str]:

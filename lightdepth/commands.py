@@ -120,7 +120,7 @@ def calibrate_light(
         data: folder of frames
         output: light.json to write, with a report beside it (light.html)
         map: COLMAP model(s) or a multi-map tree; left out, the frames' own true depth is needed
-        format: folder, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking when left out
+        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
         camera: camera.json; left out, the map's own camera, else the folder's
         mask: image, white where tissue shows
         seed: draws the bootstrap
@@ -213,7 +213,7 @@ def predict(
         data: folder of frames
         output: folder to make
         checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
-        format: folder, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking when left out
+        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
         camera: calibration file that wins over the folder's
         light: light.json, photometric XML, or gamma=2.2,mu=0, that wins over the folder's
         mask: image, white where tissue shows

@@ -140,7 +140,7 @@ def no_folder(path):
     return path / "nowhere"
 
 
-@mistake("Gives the video in place of frames", "frames", "video.mp4: is a video", "extract its frames")
+@mistake("Gives a video that is none", "frames", "video.mp4: not a video that can be read")
 def a_video(path):
     (path / "video.mp4").write_bytes(b"\0" * 64)
     return path / "video.mp4"

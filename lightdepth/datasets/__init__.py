@@ -9,10 +9,12 @@ from lightdepth.datasets.reading import FORMATS, open_sequence
 from lightdepth.datasets.scared import read_scared, write_scared
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.datasets.simcol import read_simcol, write_simcol
+from lightdepth.datasets.video import VideoFile, read_video
 
 __all__ = [
     "FORMATS",
     "FrameSequence",
+    "VideoFile",
     "open_sequence",
     "read_c3vd",
     "read_endomapper",
@@ -21,6 +23,7 @@ __all__ = [
     "read_hamlyn",
     "read_scared",
     "read_simcol",
+    "read_video",
     "write_c3vd",
     "write_endomapper",
     "write_endoslam",

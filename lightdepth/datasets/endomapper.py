@@ -38,7 +38,7 @@ from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
 
 _LEVELS = 6  # folders above the frames in which calibrations are looked for
-_GEOMETRY, _PHOTOMETRY = "geometrical", "photometrical"
+GEOMETRY, PHOTOMETRY = "geometrical", "photometrical"
 
 
 def is_endomapper(path: Path) -> bool:
@@ -46,7 +46,7 @@ def is_endomapper(path: Path) -> bool:
     if (path / "camera.json").is_file():
         return False
     named = any(re.fullmatch(r"out\d+", image.stem) for image in list_images(image_folder(path)))
-    return named or any(path.glob(f"Endoscope_*_{_GEOMETRY}.xml"))
+    return named or any(path.glob(f"Endoscope_*_{GEOMETRY}.xml"))
 
 
 def cluster_of(path: Path) -> tuple[Path, int] | None:
@@ -85,7 +85,7 @@ def read_endomapper(
         path = cluster[0]
         if camera is None and own is not None and images:
             height, width = read_image(images[0]).shape[:2]
-            camera = _at_size(own, width, height, images[0].name)
+            camera = at_size(own, width, height, images[0].name)
     if not images:
         raise InputError(f"{image_folder(path)}: {no_images(image_folder(path))}; expected out1.png, out2.png")
     if frame_number(images[0].name) < 1:
@@ -96,15 +96,15 @@ def read_endomapper(
     check_one_size(images)
     height, width = read_image(images[0]).shape[:2]
     if camera is None:
-        file = _calibration(path, _GEOMETRY)
+        file = calibration_file(path, GEOMETRY)
         if file is None:
             raise InputError(
-                f"{path}: no Endoscope_XX_{_GEOMETRY}.xml here, nor in Calibrations/ here or above; put it beside the "
+                f"{path}: no Endoscope_XX_{GEOMETRY}.xml here, nor in Calibrations/ here or above; put it beside the "
                 "frames, or give --camera FILE"
             )
-        camera = _at_size(read_camera(file), width, height, images[0].name)
+        camera = at_size(read_camera(file), width, height, images[0].name)
     if light is None:
-        file = _calibration(path, _PHOTOMETRY)
+        file = calibration_file(path, PHOTOMETRY)
         light = PhotometricCalibration() if file is None else read_light(file)
     if mask is None:
         found = [f for f in (path / "mask.png", image_folder(path) / "mask.png") if f.is_file()]
@@ -130,8 +130,8 @@ def write_endomapper(frames: Sequence[Frame], path: Path, endoscope: str = "00")
     if early:
         raise InputError(f"{path}: frame {early[0]} has number {frame_number(early[0])}; EndoMapper counts from 1")
     (path / "img_train").mkdir(parents=True)
-    write_camera(frames[0].camera, path / f"Endoscope_{endoscope}_{_GEOMETRY}.xml")
-    write_light(frames[0].light, path / f"Endoscope_{endoscope}_{_PHOTOMETRY}.xml")
+    write_camera(frames[0].camera, path / f"Endoscope_{endoscope}_{GEOMETRY}.xml")
+    write_light(frames[0].light, path / f"Endoscope_{endoscope}_{PHOTOMETRY}.xml")
     if frames[0].mask is not None:
         cv2.imwrite(str(path / "mask.png"), frames[0].mask.astype(np.uint8) * 255)
     for frame in frames:
@@ -190,14 +190,14 @@ def _frame_rate(video: Path) -> float | None:
     return float(rate) if rate else None
 
 
-def _at_size(camera: CameraModel, width: int, height: int, name: str) -> CameraModel:
+def at_size(camera: CameraModel, width: int, height: int, name: str) -> CameraModel:
     """The calibration at the size of the frames; cropped frames are refused."""
     if abs(width / camera.width / (height / camera.height) - 1) > 0.01:
         check_image_size(name, width, height, camera)
     return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
 
 
-def _calibration(path: Path, kind: str) -> Path | None:
+def calibration_file(path: Path, kind: str) -> Path | None:
     """The calibration of this kind closest to the frames; of several, the one of the sequence's endoscope."""
     for folder in _upwards(path):
         patterns = ("", "Calibrations/", "Calibrations/Endoscope_*/")

@@ -1,12 +1,14 @@
 """A folder of frames: images (in `frames/` or directly), camera.json, light.json, mask.png; truth/ where there is any.
 
+times.csv has a line `NAME,seconds` for each frame whose time is known, after a line of headings; it wins over truth's.
+
 truth/distance/NAME.tiff is float32 [mm] along the ray, 0 where unknown; truth/poses.tum holds world_from_cam, one line
 `time tx ty tz qx qy qz qw` per frame in order, millimetres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -67,6 +69,8 @@ def read_folder(
     known = {frame_number(file.name) for file in (truth / "distance").glob("*.tiff")}
     warn_of_gaps(path, [frame_number(image.name) for image in images], known)
 
+    clock = read_times(path / "times.csv") if (path / "times.csv").is_file() else {}
+
     def load(i: int) -> Frame:
         distance = truth / "distance" / f"{images[i].stem}.tiff"
         return Frame(
@@ -75,7 +79,7 @@ def read_folder(
             camera,
             light,
             mask,
-            time=None if times is None else float(times[i]),
+            time=clock.get(images[i].stem, None if times is None else float(times[i])),
             true_distance=read_raw(distance).astype(np.float32) if distance.is_file() else None,
             true_world_from_cam=None if poses is None else poses[i],
         )
@@ -104,6 +108,29 @@ def write_folder(frames: Iterable[Frame], path: Path) -> None:
         cv2.imwrite(str(path / "mask.png"), first.mask.astype(np.uint8) * 255)
     if poses:
         write_tum(path / "truth" / "poses.tum", times, poses)
+
+
+def write_times(path: Path, times: Mapping[str, float]) -> None:
+    """times.csv: the time [s] of frames by name, to the microsecond."""
+    path.write_text("name,seconds\n" + "".join(f"{name},{time:.6f}\n" for name, time in times.items()))
+
+
+def read_times(path: Path) -> dict[str, float]:
+    """Times [s] of frames by name."""
+    times = {}
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as times of frames ({error})") from error
+    for row, line in enumerate(lines[1:], 2):
+        name, _, seconds = line.partition(",")
+        try:
+            times[name] = float(seconds)
+        except ValueError:
+            times[name] = float("nan")
+        if not np.isfinite(times[name]):
+            raise InputError(f"{path}: line {row}: {line!r}; expected NAME,seconds")
+    return times
 
 
 def to_bgr8(image: np.ndarray) -> np.ndarray:

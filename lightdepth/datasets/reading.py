@@ -16,10 +16,11 @@ from lightdepth.datasets.hamlyn import is_hamlyn, read_hamlyn
 from lightdepth.datasets.scared import is_scared, read_scared
 from lightdepth.datasets.sequence import FrameSequence, image_size, legible, list_images, read_image, read_mask
 from lightdepth.datasets.simcol import is_simcol, read_simcol
+from lightdepth.datasets.video import VideoFile, read_video, video_at
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 
-FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "scared", "endoslam", "endomapper")
+FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "scared", "endoslam", "endomapper", "video")
 
 _LOOKS = {
     "c3vd": is_c3vd,
@@ -29,7 +30,6 @@ _LOOKS = {
     "endoslam": is_endoslam,
     "endomapper": is_endomapper,
 }
-_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".ts", ".wmv", ".m4v", ".webm")
 _DEEP, _MANY = 3, 200  # folders within which sequences are looked for, to name them, and entries of each
 
 
@@ -48,11 +48,6 @@ def open_sequence(
     its own maps were made with other numbers. `check_sequence` says what is doubtful.
     """
     path = Path(path)
-    if not path.is_dir() and not _is_cluster(path, format):
-        video = path.suffix.lower() in _VIDEOS
-        found = "is a video" if video else "is a file" if path.is_file() else "does not exist"
-        cure = f"; extract its frames: ffmpeg -i {path.name} frames/%06d.png" if video else ""
-        raise InputError(f"{path}: {found}; expected a folder of frames{cure}")
     try:
         return check_sequence(_open(path, format, camera, light, mask, map_camera))
     except InputError as error:
@@ -74,7 +69,16 @@ def _open(
     mask: str | Path | None,
     map_camera: CameraModel | None,
 ) -> FrameSequence:
-    if _is_cluster(path, format):
+    cluster = _is_cluster(path, format)
+    video = video_at(path) if format in (None, "video") else None
+    if video is not None:
+        return _open_video(video, camera, light, mask, map_camera)
+    if not path.is_dir() and not cluster:
+        found = "is a file" if path.is_file() else "does not exist"
+        raise InputError(f"{path}: {found}; expected a folder of frames, or a video such as .mp4 or .mov")
+    if format == "video":
+        raise InputError(f"{path}: no video in it, or images beside it; give the video file itself")
+    if cluster:
         format = "endomapper"
     if format is None:
         format = _looks_like(path) or "folder"
@@ -162,6 +166,25 @@ def _image_folder(path: Path, format: str) -> Path:
 def _read_camera(file: Path, folder: Path) -> CameraModel:
     """The camera of a file; intrinsics.txt, which holds no size, is for the images in the folder."""
     return read_camera(file, _size_of_images(folder) if file.suffix.lower() == ".txt" else None)
+
+
+def _open_video(
+    video: Path,
+    camera: str | Path | None,
+    light: str | Path | None,
+    mask: str | Path | None,
+    map_camera: CameraModel | None,
+) -> FrameSequence:
+    """The frames of a video; intrinsics.txt, which holds no size, is for the video's."""
+    chosen = None
+    if camera is not None:
+        opened = VideoFile(video)
+        size = (opened.width, opened.height) if Path(camera).suffix.lower() == ".txt" else None
+        chosen = read_camera(Path(camera), size)
+        check_image_size(str(video), opened.width, opened.height, chosen)
+    chosen_light = read_light(light) if light is not None else None
+    chosen_mask = read_mask(Path(mask)) if mask is not None else None
+    return read_video(video, chosen, chosen_light, chosen_mask, map_camera)
 
 
 def _at_size_of_images(camera: CameraModel, folder: Path) -> CameraModel:

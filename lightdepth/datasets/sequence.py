@@ -7,6 +7,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
 
@@ -62,7 +63,7 @@ class FrameSequence(Sequence[Frame]):
 
     def at(self, rows: Sequence[int]) -> FrameSequence:
         """The frames at these rows, in this order."""
-        return FrameSequence([self.names[i] for i in rows], lambda i: self._load(rows[i]), self.source)
+        return FrameSequence([self.names[i] for i in rows], _Rows(self._load, rows), self.source)
 
     def image_size(self) -> tuple[int, int]:
         """Width and height of the frames; reads the first."""
@@ -72,6 +73,17 @@ class FrameSequence(Sequence[Frame]):
     def by_number(self, number: int) -> Frame | None:
         """The frame with this number, or None."""
         return self[self.numbers.index(number)] if number in self.numbers else None
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Loads a slice's frames; unlike a closure it can be pickled, where the loader behind it can."""
+
+    load: Callable[[int], Frame]
+    rows: Sequence[int]
+
+    def __call__(self, i: int) -> Frame:
+        return self.load(self.rows[i])
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -105,8 +117,12 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
 def read_image(path: Path) -> np.ndarray:
     """(H, W, 3) float32 RGB in [0, 1]. 8- and 16-bit files alike."""
     data = decode(read_bytes(path, "image"), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR, str(path))
-    top = 65535.0 if data.dtype == np.uint16 else 255.0
-    return cv2.cvtColor(data, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(top)
+    return unit_range(cv2.cvtColor(data, cv2.COLOR_BGR2RGB, dst=data))
+
+
+def unit_range(pixels: np.ndarray) -> np.ndarray:
+    """uint8 or uint16 as float32 in [0, 1]."""
+    return np.divide(pixels, np.float32(np.iinfo(pixels.dtype).max), dtype=np.float32)
 
 
 def read_bytes(path: Path, what: str = "file") -> bytes:
@@ -177,6 +193,7 @@ def read_mask(path: Path, image: Path | None = None) -> np.ndarray:
         )
     centre = mask[int(height * 0.45) : int(height * 0.55) + 1, int(width * 0.45) : int(width * 0.55) + 1]
     mask = mask if centre.mean() >= 0.5 else ~mask
+    mask.flags.writeable = False  # one for all frames of a sequence
     if mask.all() and not (grey > 127).any():
         raise InputError(f"{path}: the mask is black everywhere; expected white where tissue shows")
     return mask
@@ -238,19 +255,49 @@ def found_mask(images: Sequence[Path], count: int = 8) -> np.ndarray:
 
 
 def border_mask(images: Sequence[np.ndarray]) -> np.ndarray:
+    """(H, W) bool: `border_region` shrunk by 0.4 % of the height, away from the halo of compression. Read-only."""
+    region = border_region(images)
+    if region.all():
+        region.flags.writeable = False
+        return region  # no border to keep away from
+    shrink = 2 * max(1, round(0.004 * region.shape[0])) + 1
+    padded = cv2.copyMakeBorder(region.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    mask = cv2.erode(padded, np.ones((shrink, shrink), np.uint8), borderValue=1)[1:-1, 1:-1].astype(bool)
+    mask.flags.writeable = False  # one for all frames of a sequence
+    return mask
+
+
+def border_region(images: Sequence[np.ndarray]) -> np.ndarray:
     """(H, W) bool: what is not the black border, found in images (H, W, 3) of one camera by their brightest values.
 
-    The largest bright region with its holes filled (a dark lumen is tissue too), shrunk by 0.4 % of the height. Images
-    of another size than the first are left out: Frame refuses them by name.
+    The largest bright region with its holes filled (a dark lumen is tissue too), without bulges narrower than 5 % of
+    the height (text at its rim). A border that is black but noisy raises the threshold. Images of another size than
+    the first are left out: Frame refuses them by name.
     """
-    bright = np.max([image.max(-1) for image in images if image.shape == images[0].shape], axis=0) > 16 / 255
-    size = max(3, round(0.01 * bright.shape[0])) | 1
-    closed = cv2.morphologyEx(bright.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
+    tops = [image.max(-1) for image in images if image.shape == images[0].shape]
+    height = len(tops[0])
+    # The median takes noise and thin text away before the brightest value over the images is taken.
+    smooth = [cv2.medianBlur(np.rint(255 * top).astype(np.uint8), 3) for top in tops]
+    brightest = np.max(smooth, axis=0)
+    patch = max(2, height // 40)
+    corners = np.concatenate([brightest[rows, columns].ravel() for rows, columns in _corners(patch)])
+    level = float(np.median(corners))
+    threshold = 16.0 if level >= 16 else min(40.0, max(16.0, level + 1.5 * (np.quantile(corners, 0.9) - level) + 6))
+    size = max(3, round(0.01 * height)) | 1
+    closed = cv2.morphologyEx(
+        (brightest > threshold).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)
+    )
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
-        return np.ones(bright.shape, bool)
+        return np.ones(brightest.shape, bool)
     filled = cv2.drawContours(np.zeros_like(closed), [max(contours, key=cv2.contourArea)], -1, 1, cv2.FILLED)
-    shrink = 2 * max(1, round(0.004 * bright.shape[0])) + 1
-    padded = cv2.copyMakeBorder(filled, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    eroded = cv2.erode(padded, np.ones((shrink, shrink), np.uint8), borderValue=1)[1:-1, 1:-1]
-    return eroded.astype(bool)
+    bulge = max(3, round(0.05 * height)) | 1
+    padded = cv2.copyMakeBorder(filled, bulge, bulge, bulge, bulge, cv2.BORDER_REPLICATE)
+    opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, np.ones((bulge, bulge), np.uint8))
+    opened = opened[bulge:-bulge, bulge:-bulge]
+    return (opened if opened.any() else filled).astype(bool)
+
+
+def _corners(size: int) -> list[tuple[slice, slice]]:
+    first, last = slice(0, size), slice(-size, None)
+    return [(first, first), (first, last), (last, first), (last, last)]

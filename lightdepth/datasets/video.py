@@ -1,0 +1,399 @@
+"""A video file: frame n is the n-th picture that it shows, counting from 0, at the time [s] the file gives it.
+
+Opening reads the packets once without decoding them: their presentation times, in order, are the frames. Reading goes
+forward from where it is, or from the keyframe before; a decoded picture is known by its own time, so what comes back is
+exact after any jump. Frames that the file lacks or that do not decode are refused by number, the others are given.
+
+Pictures are turned as the file says (90, 180, 270 degrees), and keep 16 bits where the file has more than 8.
+Calibration is looked for beside the file: camera.json, light.json, mask.png, else EndoMapper's, as for its frames.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+
+from lightdepth.calibration import read_camera, read_light
+from lightdepth.camera import CameraModel
+from lightdepth.datasets import endomapper
+from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask, unit_range
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame
+from lightdepth.photometry import PhotometricCalibration
+
+VIDEO_SUFFIXES = (
+    ".mp4",
+    ".mov",
+    ".m4v",
+    ".avi",
+    ".mkv",
+    ".webm",
+    ".mpg",
+    ".mpeg",
+    ".m2v",
+    ".vob",
+    ".ts",
+    ".mts",
+    ".m2ts",
+    ".wmv",
+    ".asf",
+    ".mxf",
+    ".flv",
+    ".mjpeg",
+    ".ogv",
+    ".dv",
+)
+# Formats that hold pictures themselves. Playlists, which name other files or hosts, are not among them.
+_FORMATS = "mov,matroska,avi,mpeg,mpegts,mpegvideo,asf,mxf,flv,mjpeg,ogg,dv,h264,hevc,m4v,nut,ivf,yuv4mpegpipe"
+
+
+_TECHNICAL = {
+    "major_brand",
+    "minor_version",
+    "compatible_brands",
+    "encoder",
+    "handler_name",
+    "vendor_id",
+    "language",
+    "duration",
+    "software",
+}
+
+
+@dataclass(frozen=True)
+class _Index:
+    """What the packets say. pts (n,) increasing [time_base]; keyframes are positions in it, the first is 0."""
+
+    pts: list[int]
+    keyframes: list[int]
+    by_time: bool  # False: times are missing or double, pictures are counted from the start
+
+
+class _Decoder:
+    """A file open in one process: `at` is the least index that may come next, `pending` what came and was not taken."""
+
+    def __init__(self, container: Any, stream: Any, pid: int):
+        self.container, self.stream, self.pid = container, stream, pid
+        self.restart()
+
+    def restart(self) -> None:
+        """From where the container was put."""
+        self.frames = _decoded(self.container, self.stream)
+        self.pending: tuple[int, Any] | None = None
+        self.at = 0
+
+
+class VideoFile:
+    """Pictures of a video by index. One reader at a time decodes; every process opens the file for itself.
+
+    `times` (n,) [s], NaN where the file does not tell; `missing` frames at the end are announced by the file's header
+    and not in it; `keyframes` are indices that are quick to reach; `tags` name the metadata that may tell a patient.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        self._lock = threading.Lock()
+        self._decoder: _Decoder | None = None
+        self._last: tuple[int, np.ndarray] | None = None
+        container, stream = self._opened()
+        with container:
+            codec = stream.codec_context
+            self.codec, self.format = codec.name, container.format.name
+            self.rate = None if stream.average_rate is None else float(stream.average_rate)
+            self.pixel_aspect = float(stream.sample_aspect_ratio or 1)
+            self.tags = sorted({key.lower() for key in (*container.metadata, *stream.metadata)} - _TECHNICAL)
+            time_base, expected = stream.time_base, stream.frames
+            index, stamps = _index_of(container, stream)
+        self.missing = max(0, expected - len(stamps)) if "mov" in self.format else 0  # others only estimate
+        first = self._first_decoded()
+        if index is not None and first.pts in index.pts:
+            index = _from(index, index.pts.index(first.pts))  # what comes before the first keyframe never decodes
+        else:
+            index = self._counted()
+        self._index = index
+        self._position = {pts: i for i, pts in enumerate(index.pts)}
+        self.keyframes = index.keyframes
+        self.interlaced = bool(first.interlaced_frame)
+        self.rotation = first.rotation % 360
+        self.bits = max(component.bits for component in first.format.components)
+        self.height, self.width = self._pixels(first).shape[:2]
+        times = self._times(stamps, time_base)
+        self.times = np.array(times + [np.nan] * self.missing)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def read(self, index: int) -> np.ndarray:
+        """Picture (H, W, 3) RGB, uint8, or uint16 where the file has more than 8 bits."""
+        with self._lock:
+            return self._read(range(len(self))[index])
+
+    def _read(self, index: int) -> np.ndarray:
+        count = len(self._index.pts)
+        if index >= count:
+            raise InputError(
+                f"{self.path}: frame {index} is not there; the header announces {len(self)} frames and {count} are in "
+                "the file, which was cut off. Copy it again, or use the frames before"
+            )
+        if self._last is None or self._last[0] != index:
+            self._last = (index, self._pixels(self._decoded_at(index)))
+        return self._last[1]
+
+    def _decoded_at(self, index: int) -> Any:
+        decoder = self._decoder_before(index)
+        while True:
+            at, frame = self._upcoming(decoder)
+            if frame is None or at > index:
+                raise InputError(
+                    f"{self.path}: frame {index} of {len(self)} does not decode; the file is damaged there. Others are "
+                    "given: leave this one out"
+                )
+            decoder.pending, decoder.at = None, at + 1
+            if at == index:
+                return frame
+
+    def _upcoming(self, decoder: _Decoder) -> tuple[int, Any]:
+        """The next decoded picture and its index, without taking it; None at the end."""
+        while decoder.pending is None:
+            frame = next(decoder.frames, None)
+            if frame is None:
+                return len(self), None
+            at = self._position.get(frame.pts) if self._index.by_time else decoder.at
+            if at is not None and at >= decoder.at:
+                decoder.pending = (at, frame)
+        return decoder.pending
+
+    def _decoder_before(self, index: int) -> _Decoder:
+        """A decoder that comes to `index`: the one there is, where that is the shortest way, else one put on the
+        keyframe before, or on an earlier one where the container's jump went too far."""
+        decoder, keyframes = self._decoder, self._index.keyframes
+        before = bisect_right(keyframes, index) - 1
+        if decoder is not None and decoder.pid != os.getpid():
+            decoder = None  # a forked process shares the place in the file with its parent
+        if decoder is not None and keyframes[before] <= decoder.at <= index:
+            return decoder
+        for start in dict.fromkeys(keyframes[k] for k in (before, max(before - 1, 0), 0)):
+            if start == 0 or decoder is None:
+                if decoder is not None:
+                    decoder.container.close()
+                decoder = self._decoder = _Decoder(*self._opened(), os.getpid())
+            if start > 0:
+                decoder.container.seek(self._index.pts[start], stream=decoder.stream)
+            decoder.restart()
+            if start == 0 or self._upcoming(decoder)[0] <= index:
+                break
+        assert decoder is not None
+        return decoder
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_lock": None, "_decoder": None, "_last": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lock = threading.Lock()
+
+    def _opened(self) -> tuple[Any, Any]:
+        try:
+            container = av.open(str(self.path), options={"format_whitelist": _FORMATS, "protocol_whitelist": "file"})
+        except (av.error.FFmpegError, OSError) as error:
+            raise InputError(f"{self.path}: not a video that can be read ({error.strerror or error})") from error
+        if not container.streams.video:
+            container.close()
+            raise InputError(f"{self.path}: no pictures in it; expected a video")
+        stream = container.streams.video[0]
+        # A process that is forked while a decoder has threads, as a DataLoader's workers are, hangs when it frees it.
+        stream.thread_type, stream.codec_context.thread_count = "NONE", 1
+        return container, stream
+
+    def _first_decoded(self) -> Any:
+        container, stream = self._opened()
+        with container:
+            frame = next(_decoded(container, stream), None)
+        if frame is None:
+            raise InputError(f"{self.path}: none of its pictures decodes; it is damaged, or not a video")
+        return frame
+
+    def _counted(self) -> _Index:
+        """By decoding all of it: for the few files whose packets do not tell."""
+        container, stream = self._opened()
+        with container:
+            found = [(frame.pts, frame.key_frame) for frame in _decoded(container, stream)]
+        times = [pts for pts, _ in found]
+        if None not in times and all(a < b for a, b in pairwise(times)):
+            return _Index(times, sorted({0, *(i for i, (_, key) in enumerate(found) if key)}), True)
+        return _Index(list(range(len(found))), [0], False)
+
+    def _times(self, stamps: list[int | None], time_base: Fraction) -> list[float]:
+        """Times [s] of the pictures: their own; else those of the packets in order, one each; else by the rate."""
+        if self._index.by_time:
+            return [float(pts * time_base) for pts in self._index.pts]
+        known = sorted({stamp for stamp in stamps if stamp is not None})
+        if len(known) == len(self._index.pts):
+            return [float(stamp * time_base) for stamp in known]
+        return [i / self.rate if self.rate else float("nan") for i in range(len(self._index.pts))]
+
+    def _pixels(self, frame: Any) -> np.ndarray:
+        pixels = frame.to_ndarray(format="rgb48le" if self.bits > 8 else "rgb24", threads=1)
+        return np.ascontiguousarray(np.rot90(pixels, self.rotation // 90)) if self.rotation else pixels
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What is known of a video's endoscope; None where nothing was found."""
+
+    camera: CameraModel | None = None
+    light: PhotometricCalibration | None = None
+    mask: np.ndarray | None = None
+
+
+def found_calibration(path: Path, width: int, height: int) -> Calibration:
+    """camera.json, light.json and mask.png beside a video of this size, else EndoMapper's calibration.
+
+    Raises InputError where EndoMapper's tree says that the endoscope has none.
+    """
+    folder = path.parent
+    camera = light = None
+    if (folder / "camera.json").is_file():
+        camera = read_camera(folder / "camera.json")
+    elif (file := endomapper.calibration_file(folder, endomapper.GEOMETRY)) is not None:
+        camera = endomapper.at_size(read_camera(file), width, height, path.name)
+    if (folder / "light.json").is_file():
+        light = read_light(folder / "light.json")
+    elif (file := endomapper.calibration_file(folder, endomapper.PHOTOMETRY)) is not None:
+        light = read_light(file)
+    mask = read_mask(folder / "mask.png") if (folder / "mask.png").is_file() else None
+    return Calibration(camera, light, mask)
+
+
+def video_at(path: Path) -> Path | None:
+    """The video that a path means: the file itself, or the only one in a folder without images, such as EndoMapper's
+    Seq_NNN. None where there is none; InputError where there are several."""
+    if path.is_file():
+        return path if path.suffix.lower() in VIDEO_SUFFIXES else None
+    if not path.is_dir() or list_images(path) or list_images(endomapper.image_folder(path)):
+        return None
+    videos = sorted(file for file in path.iterdir() if file.is_file() and file.suffix.lower() in VIDEO_SUFFIXES)
+    if len(videos) > 1:
+        raise InputError(f"{path}: {len(videos)} videos ({', '.join(v.name for v in videos)}); give one of them")
+    return videos[0] if videos else None
+
+
+def read_video(
+    path: Path,
+    camera: CameraModel | None = None,
+    light: PhotometricCalibration | None = None,
+    mask: np.ndarray | None = None,
+    map_camera: CameraModel | None = None,
+) -> FrameSequence:
+    """Frames of a video file, named 000000, 000001, ... What is given wins over what lies beside the file; `map_camera`
+    serves where there is no camera.json. Without any camera it is refused; without a mask the black border is found."""
+    video = VideoFile(path)
+    if camera is None and map_camera is not None and not (path.parent / "camera.json").is_file():
+        camera = endomapper.at_size(map_camera, video.width, video.height, path.name)
+    if camera is None or light is None or mask is None:
+        found = found_calibration(path, video.width, video.height) if camera is None else _without_camera(path, video)
+        camera, light = camera or found.camera, light or found.light
+        mask = found.mask if mask is None else mask
+    if camera is None:
+        raise InputError(
+            f"{path}: no camera.json beside it; give --camera FILE "
+            '({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), or a map that has one'
+        )
+    if mask is None:
+        mask = _found_mask(video)
+    names = [f"{i:06d}" for i in range(len(video))]
+    return FrameSequence(names, _Load(video, camera, light or PhotometricCalibration(), mask), str(path))
+
+
+def quick_sample(video: VideoFile, count: int) -> list[int]:
+    """So many frames, spread over a video; keyframes where there are enough of them."""
+    there = video.keyframes if len(video.keyframes) >= count else range(len(video) - video.missing)
+    return [there[i] for i in np.unique(np.linspace(0, len(there) - 1, count).round().astype(int))]
+
+
+def _found_mask(video: VideoFile, count: int = 8) -> np.ndarray:
+    """`border_mask` of some frames that decode."""
+    images = []
+    for i in [0, *quick_sample(video, count)]:  # the first decodes, or the file would have been refused
+        try:
+            images.append(unit_range(video.read(i)))
+        except InputError:
+            continue  # refused by number when it is asked for
+    return border_mask(images)
+
+
+@dataclass(frozen=True)
+class _Load:
+    """Reads frame i. Can be pickled: every worker opens the file for itself."""
+
+    video: VideoFile
+    camera: CameraModel
+    light: PhotometricCalibration
+    mask: np.ndarray
+
+    def __call__(self, i: int) -> Frame:
+        time = float(self.video.times[i])
+        image = unit_range(self.video.read(i))
+        return Frame(f"{i:06d}", image, self.camera, self.light, self.mask, None if np.isnan(time) else time)
+
+
+def _without_camera(path: Path, video: VideoFile) -> Calibration:
+    """Light and mask beside a video whose camera is given; an endoscope without calibration has neither."""
+    try:
+        return found_calibration(path, video.width, video.height)
+    except InputError:
+        mask = path.parent / "mask.png"
+        return Calibration(mask=read_mask(mask) if mask.is_file() else None)
+
+
+def _index_of(container: Any, stream: Any) -> tuple[_Index | None, list[int | None]]:
+    """Times and keyframes from the packets, None where they do not tell; and when each packet is decoded."""
+    shown, stamps, known = [], [], True
+    try:
+        for packet in container.demux(stream):
+            if packet.size == 0:  # the end, or a frame that AVI repeats
+                continue
+            stamps.append(packet.dts)
+            if packet.pts is None:
+                known = False
+            elif not packet.is_discard:
+                shown.append((packet.pts, packet.is_keyframe))
+    except av.error.FFmpegError:
+        pass  # cut off in the middle of a packet: what came before counts
+    shown.sort()
+    pts = [p for p, _ in shown]
+    if not known or not pts or any(a == b for a, b in pairwise(pts)):
+        return None, stamps
+    return _Index(pts, sorted({0, *(i for i, (_, key) in enumerate(shown) if key)}), True), stamps
+
+
+def _from(index: _Index, first: int) -> _Index:
+    keyframes = sorted({0, *(k - first for k in index.keyframes if k >= first)})
+    return _Index(index.pts[first:], keyframes, True)
+
+
+def _decoded(container: Any, stream: Any) -> Iterator[Any]:
+    """Pictures in the order they are shown; what is damaged is left out."""
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+        except av.error.FFmpegError:
+            packet = None
+        if packet is None:
+            break
+        try:
+            frames = packet.decode()
+        except av.error.FFmpegError:
+            continue
+        yield from (frame for frame in frames if not frame.is_corrupt)

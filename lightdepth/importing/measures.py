@@ -1,0 +1,122 @@
+"""Numbers that say how good a frame is: sharpness, exposure, motion, combing.
+
+All are taken where tissue shows, on 8-bit values. Sharpness is the deviation of the Laplacian over the mean brightness,
+at no more than 640 columns, so that neither exposure nor sensor noise passes for detail. Combing compares rows with
+their neighbours and with those of their own field: in interlaced pictures of a moving scene the next row but one is
+more alike than the next.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+COLUMNS = 640
+THUMBNAIL = 64
+WHITE, BLACK = 250, 16
+
+
+@dataclass(frozen=True)
+class Measures:
+    """One number per frame (n,). Frames that could not be read are NaN everywhere.
+
+    brightness: mean of the brightest channel, 0..255; saturated: share of pixels white in all channels; dark: share
+    black in all; sharpness; change: mean difference from the frame before, 0..255, infinite for the first; combing: of
+    neighbouring rows over that of next-but-one rows; red, green, blue: means, 0..255.
+    """
+
+    brightness: np.ndarray
+    saturated: np.ndarray
+    dark: np.ndarray
+    sharpness: np.ndarray
+    change: np.ndarray
+    combing: np.ndarray
+    red: np.ndarray
+    green: np.ndarray
+    blue: np.ndarray
+
+    @property
+    def readable(self) -> np.ndarray:
+        return np.isfinite(self.brightness)
+
+
+class Meter:
+    """Measures frames (H, W, 3) one after the other, over a mask (H, W) that is the same for all."""
+
+    def __init__(self, mask: np.ndarray):
+        height, width = mask.shape
+        self._size = (min(width, COLUMNS), max(1, round(height * min(width, COLUMNS) / width)))
+        share = cv2.resize(mask.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
+        self._mask = (share > 0.999).astype(np.uint8)
+        self._pixels = int(self._mask.sum())
+        self._inner = cv2.erode(np.pad(self._mask, 1), np.ones((5, 5), np.uint8), borderValue=1)[1:-1, 1:-1].copy()
+        self._step = max(1, width // 160)
+        stripes = mask[:, :: self._step]
+        self._rows_of_three = (stripes[:-2] & stripes[1:-1] & stripes[2:]).astype(np.uint8)
+        self._before: np.ndarray | None = None
+        self._found: list[list[float]] = []
+
+    def unreadable(self) -> None:
+        self._found.append([np.nan] * 9)
+        self._before = None
+
+    def add(self, pixels: np.ndarray) -> None:
+        if not self._pixels:
+            self.unreadable()
+            return
+        pixels = eight_bits(pixels)
+        small = cv2.resize(pixels, self._size, interpolation=cv2.INTER_AREA)
+        channels = cv2.split(small)
+        top = cv2.max(cv2.max(channels[0], channels[1]), channels[2])
+        low = cv2.min(cv2.min(channels[0], channels[1]), channels[2])
+        grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        # Highlights are the sharpest edges of a blurred frame too.
+        detail = cv2.Laplacian(np.minimum(grey, 220), cv2.CV_32F, ksize=3)
+        thumb = cv2.resize(grey, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
+        change = np.inf if self._before is None else _mean(cv2.absdiff(thumb, self._before))
+        self._before = thumb
+        brightness = _mean(top, self._mask)
+        self._found.append(
+            [
+                brightness,
+                _mean(cv2.inRange(low, WHITE, 255), self._mask) / 255,
+                _mean(cv2.inRange(top, 0, BLACK - 1), self._mask) / 255,
+                float(cv2.meanStdDev(detail, mask=self._inner)[1][0, 0]) / max(brightness, 1.0),
+                change,
+                self._combing(pixels),
+                *(_mean(channel, self._mask) for channel in channels),
+            ]
+        )
+
+    def _combing(self, pixels: np.ndarray) -> float:
+        if not self._rows_of_three.any():
+            return 1.0
+        rows = np.ascontiguousarray(pixels[:, :: self._step, 1])
+        next_row = cv2.absdiff(rows[1:], rows[:-1])
+        neighbours = _mean(next_row[:-1], self._rows_of_three) + _mean(next_row[1:], self._rows_of_three)
+        return (neighbours + 0.5) / (2 * _mean(cv2.absdiff(rows[2:], rows[:-2]), self._rows_of_three) + 0.5)
+
+    def result(self) -> Measures:
+        return Measures(*np.array(self._found, np.float64).reshape(-1, 9).T)
+
+
+def eight_bits(pixels: np.ndarray) -> np.ndarray:
+    return (pixels >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels
+
+
+def one_field(pixels: np.ndarray) -> np.ndarray:
+    """The picture of the even rows alone: each odd row is the mean of the rows beside it. Every row stays in its place,
+    so the camera remains right."""
+    kept = pixels.copy()
+    last = len(pixels) - len(pixels) % 2 - 1
+    above, below = pixels[0 : last - 1 : 2], pixels[2 : last + 1 : 2]
+    kept[1 : 2 * len(below) : 2] = cv2.addWeighted(above[: len(below)], 0.5, below, 0.5, 0)
+    if len(pixels) % 2 == 0:
+        kept[-1] = pixels[-2]
+    return kept
+
+
+def _mean(channel: np.ndarray, mask: np.ndarray | None = None) -> float:
+    return float(cv2.mean(channel, mask=mask)[0])

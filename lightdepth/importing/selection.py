@@ -1,0 +1,79 @@
+"""Which frames are kept: by time, the sharpest of each interval, without blurred and frozen ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import percentile_filter
+
+from lightdepth.errors import InputError
+from lightdepth.importing.measures import Measures
+
+SAME = 0.1
+"""Mean difference of thumbnails, of 255, up to which a frame is the one before again."""
+KEPT, PASSED, BLURRED, FROZEN, UNREADABLE = "kept", "passed over", "blurred", "frozen", "unreadable"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which frames to keep.
+
+    Args:
+        rate: frames per second, by time: of each interval the sharpest; left out, 5 for a video, all of a folder
+        every: every n-th frame instead
+        blur: a frame is blurred whose sharpness is below this share of its neighbourhood's; 0 keeps all
+        max_frames: at most so many, spread evenly
+    """
+
+    rate: float | None = None
+    every: int | None = None
+    blur: float = 0.6
+    max_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.rate is not None and self.every is not None:
+            raise InputError(f"--rate {self.rate} and --every {self.every}; give one of them")
+        if self.rate is not None and not self.rate > 0:
+            raise InputError(f"--rate {self.rate}; expected frames per second above 0")
+        if self.every is not None and self.every < 1:
+            raise InputError(f"--every {self.every}; expected 1 or more")
+        if not 0 <= self.blur < 1:
+            raise InputError(f"--blur {self.blur}; expected a share of at least 0 and below 1")
+        if self.max_frames is not None and self.max_frames < 1:
+            raise InputError(f"--max-frames {self.max_frames}; expected 1 or more")
+
+
+def selected(times: np.ndarray, measures: Measures, choice: Choice) -> np.ndarray:
+    """(n,) what becomes of each frame: kept, passed over, blurred, frozen or unreadable. times (n,) [s] of the frames;
+    where they are unknown, `rate` cannot be used."""
+    fate = np.full(len(times), PASSED, dtype="<U12")
+    fate[~measures.readable] = UNREADABLE
+    fate[measures.readable & (measures.change <= SAME)] = FROZEN
+    left = fate == PASSED
+    blurred = left & (measures.sharpness < choice.blur * neighbourhood(measures.sharpness, times))
+    fate[blurred] = BLURRED
+    good = np.flatnonzero(left & ~blurred)
+    if choice.every is not None:
+        good = good[good % choice.every == 0]
+    elif choice.rate is not None:
+        if np.isnan(times[good]).any():
+            raise InputError("--rate: the frames have no times; choose with --every N")
+        interval = np.floor((times[good] - np.nanmin(times)) * choice.rate + 1e-6).astype(int)
+        # Sorted by interval, the sharpest first; of each interval the first.
+        order = np.lexsort((-measures.sharpness[good], interval))
+        good = np.sort(good[order[np.unique(interval[order], return_index=True)[1]]])
+    if choice.max_frames is not None and len(good) > choice.max_frames:
+        good = good[np.linspace(0, len(good) - 1, choice.max_frames).round().astype(int)]
+    fate[good] = KEPT
+    return fate
+
+
+def neighbourhood(sharpness: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """(n,) upper quartile of sharpness within about a second before and after: at least 5, at most 121 frames."""
+    steps = np.diff(times)
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    size = int(np.clip(2 / np.median(steps), 5, 121)) | 1 if len(steps) else 15
+    known = np.isfinite(sharpness)
+    filled = np.interp(np.arange(len(sharpness)), np.flatnonzero(known), sharpness[known]) if known.any() else sharpness
+    return percentile_filter(filled, 75, size=min(size, 2 * len(filled) - 1), mode="nearest")
