@@ -74,3 +74,25 @@ def camera_path(
         poses[i, :3, :3] = base @ turned
         poses[i, :3, 3] = positions[i]
     return poses
+
+
+def image_flow(distance: np.ndarray, camera: CameraModel, length: float, rng: np.random.Generator) -> np.ndarray:
+    """Flow (H, W, 2) [px] during an exposure, of median length `length` times the image height, for a random motion.
+
+    The endoscope shifts and turns at once; distance (H, W) in mm, 0 where unknown: there the flow is 0.
+    """
+    known = distance > 0
+    rays, flow = camera.rays()[0], np.zeros((*distance.shape, 2), np.float32)
+    if not known.any():
+        return flow
+    points = rays[known] * distance[known, None]
+    shift, turn = rng.normal(0, (0.15, 0.15, 0.3)), rng.normal(0, 0.01, 3)
+    ahead, ahead_valid = camera.project(points + shift + np.cross(turn, points))
+    here, here_valid = camera.project(points)
+    moved = np.where((ahead_valid & here_valid)[:, None], ahead - here, 0)
+    median = float(np.median(np.linalg.norm(moved, axis=-1)))
+    reach = rng.uniform(0, 2) * length * distance.shape[0]
+    moved *= reach / max(median, 1e-6)
+    longest = np.linalg.norm(moved, axis=-1, keepdims=True).clip(min=1e-6)
+    flow[known] = moved * np.minimum(1, 4 * reach / longest)
+    return flow

@@ -1,8 +1,10 @@
 """A synthetic colon that can be looked at: ray casting, and the light of lightdepth.photometry with what it leaves out.
 
 A view has: direct light from a spot beside the camera, light from the wall to the wall (radiosity between patches of
-the whole tube with true occlusion: not the approximation that the losses use), highlights, a tone curve, clipping,
-noise. Lengths in millimetres; images (H, W, 3); patches are a coarse grid over (s, phi).
+the whole tube with true occlusion: not the approximation that the losses use), highlights on wet and rough wall, and
+what lightdepth.tube.sensor makes of it. Lengths in millimetres; images (H, W, 3); patches are a coarse grid over
+(s, phi). Every effect beyond the first colons' draws from a generator of its own, so that switching one on or off
+changes nothing else.
 """
 
 from __future__ import annotations
@@ -15,24 +17,14 @@ import torch
 
 from lightdepth import native
 from lightdepth.camera import CameraModel
-from lightdepth.photometry import PhotometricCalibration, encode, irradiance
+from lightdepth.photometry import PhotometricCalibration, irradiance
 from lightdepth.radiosity import form_factors
+from lightdepth.tube.film import FilmConfig, cover, fine_relief
+from lightdepth.tube.path import image_flow
+from lightdepth.tube.polyps import tinted
+from lightdepth.tube.sensor import SensorConfig, draw_sensor, expose
 from lightdepth.tube.shape import ShapeConfig, TubeShape, make_shape, smooth_noise
 from lightdepth.tube.texture import TextureConfig, make_texture
-
-
-@dataclass(frozen=True)
-class SensorConfig:
-    """Light and camera of one endoscope; pairs are the ends of a uniform range."""
-
-    gamma: tuple[float, float] = (2.0, 2.6)
-    mu: tuple[float, float] = (2.2, 3.4)
-    light_offset: float = 2.0  # mm, deviation of the light's position sideways
-    reflectance: tuple[float, float] = (0.0, 0.7)
-    specular: tuple[float, float] = (0.0, 0.5)
-    bright_share: tuple[float, float] = (0.03, 0.2)  # share of pixels that auto exposure lets saturate
-    shoulder: tuple[float, float] = (0.75, 1.0)  # code value at which the tone curve starts to bend
-    noise: tuple[float, float] = (0.003, 0.012)  # deviation in code values
 
 
 @dataclass(frozen=True)
@@ -40,6 +32,60 @@ class TubeConfig:
     shape: ShapeConfig = field(default_factory=ShapeConfig)
     texture: TextureConfig = field(default_factory=TextureConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    film: FilmConfig = field(default_factory=FilmConfig)
+
+
+def realistic() -> TubeConfig:
+    """Colons with every effect, over ranges whose brightness behaves as in real frames and beyond on both sides
+    (lightdepth.tube.exponents): what networks are trained on."""
+    return TubeConfig(
+        ShapeConfig(
+            length=180.0,
+            bend=(0.1, 1.4),
+            fold_spacing=(10.0, 28.0),
+            fold_depth=(0.12, 0.45),
+            bump=(0.01, 0.06),
+            crescent=(0.2, 1.0),
+            waviness=(0.3, 1.8),
+            taeniae=(0.0, 0.12),
+            polyps=(0, 4),
+        ),
+        TextureConfig(
+            hue=(-0.01, 0.055),
+            saturation=(0.35, 0.75),
+            value=(0.0, 0.15),
+            vessels=(5, 60),
+            vessel_width=(0.15, 0.6),
+            vessel_value=(0.0, 0.3),
+            vessel_strength=(0.2, 1.0),
+            blotches=(0.0, 0.25),
+            speckle=(0.0, 0.03),
+        ),
+        SensorConfig(
+            gamma=(1.8, 2.6),
+            mu=(1.6, 3.4),
+            reflectance=(0.0, 0.7),
+            specular=(0.0, 0.5),
+            bright_share=(0.01, 0.35),
+            shoulder=(0.7, 1.0),
+            exposure=(0.05, 0.2),
+            cosine_exponent=(0.6, 1.0),
+            gloss=(30.0, 200.0),
+            roughness=(0.02, 0.12),
+            sparkle=(0.0, 0.3),
+            vignetting=(0.0, 0.5),
+            glare=(0.0, 0.06),
+            bloom=(0.0, 0.15),
+            motion=(0.0, 0.008),
+            defocus=(0.0, 0.003),
+            cast=(0.0, 0.06),
+            contrast=(-0.1, 0.3),
+            shot_noise=(0.0, 0.02),
+            sharpen=(0.0, 0.6),
+            jpeg=(60, 100),
+        ),
+        FilmConfig(mucus=(0.0, 0.35), bubbles=(0, 4), stool=(0, 12)),
+    )
 
 
 @dataclass(frozen=True)
@@ -57,19 +103,25 @@ class Tube:
 
     def __init__(self, config: TubeConfig, rng: np.random.Generator, light: PhotometricCalibration | None = None):
         o3d = native.open3d()
+        film_rng, surface_rng, sensor_rng, tint_rng = rng.spawn(4)
         self.shape: TubeShape = make_shape(config.shape, rng)
         rings, spokes = self.shape.vertices.shape[:2]
         circumference = 2 * np.pi * float(self.shape.radius.mean())
-        self.albedo = make_texture(rings * self.shape.step, circumference, config.texture, rng)
+        albedo = make_texture(rings * self.shape.step, circumference, config.texture, rng)
+        albedo = tinted(albedo, self.shape.polyps, self.shape.radius, spokes, self.shape.step, tint_rng)
+        self.albedo, self.film = cover(albedo, config.texture.resolution, config.film, film_rng)
         self._bumps = [smooth_noise((rings * 2, spokes * 2), (0.9, 0.9), rng).astype(np.float32) for _ in range(2)]
         sensor = config.sensor
         self.light = _draw_light(sensor, rng)
         if light is not None:
             self.light = replace(light, reflectance=light.reflectance or self.light.reflectance)
         self.specular = rng.uniform(*sensor.specular)
-        self.bright_share = rng.uniform(*sensor.bright_share)
-        self.shoulder = rng.uniform(*sensor.shoulder)
-        self.noise = rng.uniform(*sensor.noise)
+        older = [rng.uniform(*ends) for ends in (sensor.bright_share, sensor.shoulder, sensor.noise)]
+        self.sensor = draw_sensor(sensor, self.light.gamma, *older, sensor_rng)
+        self.cosine_exponent = surface_rng.uniform(*sensor.cosine_exponent)
+        self.gloss, self.roughness = surface_rng.uniform(*sensor.gloss), surface_rng.uniform(*sensor.roughness)
+        self.sparkle = surface_rng.uniform(*sensor.sparkle)
+        self._relief = fine_relief(surface_rng) if self.sparkle > 0 else None
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         self._tensor = lambda array: o3d.core.Tensor(np.ascontiguousarray(array, np.float32))
         self._scene.add_triangles(
@@ -79,6 +131,7 @@ class Tube:
 
     def view(self, world_from_cam: np.ndarray, camera: CameraModel, mask: np.ndarray, rng: np.random.Generator) -> View:
         """What the endoscope sees from a pose (4, 4) [mm]; pixels outside mask (H, W) are black."""
+        (own,) = rng.spawn(1)
         rays, rays_valid = camera.rays()
         wanted = mask & rays_valid
         directions = rays[wanted] @ world_from_cam[:3, :3].T
@@ -91,23 +144,14 @@ class Tube:
         normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-9) @ world_from_cam[:3, :3]
         rows, columns = wanted.nonzero()
         index = (rows[met], columns[met])
-        linear = self._shade(t[met], normals, rays[index], ring, spoke, world_from_cam)
-
-        # Auto exposure on the brightest channel, then the response, its shoulder and the sensor.
-        target = np.quantile(linear.max(-1), 1 - self.bright_share) if len(linear) else 1.0
-        gain = float(np.exp(rng.normal(0, 0.1))) / max(target, 1e-12)
-        code = encode(torch.from_numpy(gain * linear), self.light.gamma).numpy()
-        bend = max(1 - self.shoulder, 1e-3)
-        excess = np.clip(code - self.shoulder, 0, None)
-        code = np.where(excess > 0, self.shoulder + bend * (1.15 - 1.15 * np.exp(-excess / bend)), code)
-        code = code + rng.normal(0, self.noise, code.shape)
-
-        image = np.zeros((camera.height, camera.width, 3), np.float32)
-        image[index] = np.round(np.clip(code, 0, 1) * 255) / 255
         distance = np.zeros(mask.shape, np.float32)
         distance[index] = t[met]
         all_normals = np.zeros((*mask.shape, 3), np.float32)
         all_normals[index] = normals
+        linear = np.zeros((*mask.shape, 3))
+        linear[index] = self._shade(t[met], normals, rays[index], ring, spoke, world_from_cam)
+        flow = image_flow(distance, camera, self.sensor.motion, own) if self.sensor.motion > 0 else None
+        image = expose(linear, distance > 0, rays[..., 2], flow, self.sensor, rng, own)
         return View(image, distance, all_normals)
 
     def distance_to_wall(self, points: np.ndarray) -> np.ndarray:
@@ -140,23 +184,56 @@ class Tube:
         indirect = _bilinear(self._indirect(world_from_cam), *self._to_map(ring, spoke, self._patches.grid))
         linear = albedo * (direct[:, None] + indirect)
         if self.specular > 0:
-            slopes = [_bilinear(b[..., None], *self._to_map(ring, spoke, b))[:, 0] for b in self._bumps]
-            # Towards the closed end the grid's cells shrink to a point: keep the bumps from becoming spokes there.
-            row = np.clip(ring.astype(int), 0, len(self.shape.radius) - 1)
-            flat = np.clip(self.shape.radius[row] / self.shape.radius.mean() - 0.3, 0, 0.7) / 0.7
-            slopes = [slope * flat for slope in slopes]
-            tilted = normals + 0.10 * np.stack([slopes[0], slopes[1], np.zeros_like(slopes[0])], -1)
-            tilted /= np.linalg.norm(tilted, axis=-1, keepdims=True)
-            lobe = np.clip((-rays * tilted).sum(-1), 0, 1) ** 60
-            linear = linear + (self.specular * lobe * self._direct(t, -rays, rays) * 4)[:, None]
+            linear = linear + self._highlights(t, normals, rays, ring, spoke, world_from_cam)[:, None]
         return linear
+
+    def _highlights(
+        self,
+        t: np.ndarray,
+        normals: np.ndarray,
+        rays: np.ndarray,
+        ring: np.ndarray,
+        spoke: np.ndarray,
+        world_from_cam: np.ndarray,
+    ) -> np.ndarray:
+        """White light (n,) that the wet surface mirrors back."""
+        slopes = [_bilinear(b[..., None], *self._to_map(ring, spoke, b))[:, 0] for b in self._bumps]
+        # Towards the closed end the grid's cells shrink to a point: keep the bumps from becoming spokes there.
+        row = np.clip(ring.astype(int), 0, len(self.shape.radius) - 1)
+        flat = np.clip(self.shape.radius[row] / self.shape.radius.mean() - 0.3, 0, 0.7) / 0.7
+        gloss: np.ndarray | float = self.gloss
+        strength: np.ndarray | float = self.specular
+        rough: np.ndarray | float = self.roughness
+        film = self.film
+        if film.wet is not None:  # mucus is smoother and shines more than the wall
+            wet = _bilinear(film.wet[..., None], *self._to_map(ring, spoke, film.wet))[:, 0]
+            gloss, strength, rough = gloss * (1 + wet), strength * (0.7 + wet), rough * (1 - 0.4 * wet)
+        slopes = [slope * flat for slope in slopes]
+        tilted = normals + (rough * np.stack([slopes[0], slopes[1], np.zeros_like(slopes[0])], 0)).T
+        if self._relief is not None or film.slopes is not None:
+            fine = np.zeros((len(t), 2), np.float32)
+            if self._relief is not None:
+                texels, spokes = 0.15, self.shape.vertices.shape[1]
+                place = np.stack([ring * self.shape.step, spoke * 2 * np.pi * self.shape.radius.mean() / spokes], -1)
+                u, v = np.round(place / texels).astype(int).T % len(self._relief)
+                # Relief smaller than a pixel is averaged away.
+                unresolved = 0.02 * t / texels
+                fine += (self.sparkle * flat / np.sqrt(1 + unresolved**2))[:, None] * self._relief[u, v]
+            if film.slopes is not None:
+                fine += _bilinear(film.slopes, *self._to_map(ring, spoke, film.slopes))
+            along_s = self.shape.frames[row, 0] @ world_from_cam[:3, :3]
+            along_phi = np.cross(along_s, normals)
+            tilted = tilted + fine[:, :1] * along_s + fine[:, 1:] * along_phi
+        tilted /= np.linalg.norm(tilted, axis=-1, keepdims=True)
+        lobe = np.clip((-rays * tilted).sum(-1), 0, 1) ** gloss
+        return strength * lobe * self._direct(t, -rays, rays) * 4
 
     def _direct(self, t: np.ndarray, normals: np.ndarray, rays: np.ndarray) -> np.ndarray:
         def image(array: np.ndarray) -> torch.Tensor:
             return torch.from_numpy(np.ascontiguousarray(array.reshape(len(t), -1).T))[None, :, None, :].double()
 
         light = self.light.terms(torch.float64)
-        return irradiance(image(t), image(normals), image(rays), light).numpy().ravel()
+        return irradiance(image(t), image(normals), image(rays), light, self.cosine_exponent).numpy().ravel()
 
     def _to_map(self, ring: np.ndarray, spoke: np.ndarray, array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mesh grid position -> position on another map over (s, phi)."""
@@ -179,7 +256,7 @@ class Tube:
         kernel = form_factors(
             *(torch.from_numpy(np.ascontiguousarray(a))[None].float() for a in (points, normals, areas))
         )
-        factors = kernel[0].numpy()
+        factors = kernel[0].double().numpy()  # double, so that no bounce has to convert it
         # A patch cannot light what it does not see.
         i, j = np.nonzero(np.triu(factors + factors.T) > 1e-6)
         lifted = points + 0.4 * normals
@@ -242,6 +319,8 @@ def _bilinear(array: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
     c0 = np.floor(column).astype(int)
     fc = (column - c0)[:, None].astype(np.float32)
     c0, c1 = c0 % columns, (c0 + 1) % columns
-    upper = array[r0, c0] * (1 - fc) + array[r0, c1] * fc
-    lower = array[r0 + 1, c0] * (1 - fc) + array[r0 + 1, c1] * fc
+    flat = array.reshape(rows * columns, -1)
+    first, second = r0 * columns + c0, r0 * columns + c1
+    upper = flat.take(first, 0) * (1 - fc) + flat.take(second, 0) * fc
+    lower = flat.take(first + columns, 0) * (1 - fc) + flat.take(second + columns, 0) * fc
     return upper * (1 - fr) + lower * fr

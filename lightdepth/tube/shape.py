@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from lightdepth.tube.polyps import Polyp, draw_polyps, raised
+
 
 @dataclass(frozen=True)
 class ShapeConfig:
@@ -24,12 +26,18 @@ class ShapeConfig:
     fold_width: tuple[float, float] = (1.6, 3.2)
     bump: tuple[float, float] = (0.01, 0.05)  # share of the radius, undulation between the folds
     step: float = 0.8  # grid spacing
+    crescent: tuple[float, float] = (0.0, 0.0)  # how unlike the three parts of a fold are: 1, and some are missing
+    waviness: tuple[float, float] = (0.0, 0.0)  # mm, deviation of a fold's course from a plane
+    taeniae: tuple[float, float] = (0.0, 0.0)  # share of the radius by which three bands pull the wall inwards
+    polyps: tuple[int, int] = (0, 0)
+    polyp_radius: tuple[float, float] = (1.5, 5.0)  # of the head
+    stalked: float = 0.35  # share of polyps on a stalk
 
 
 @dataclass(frozen=True)
 class TubeShape:
     """centers (R, 3) and frames (R, 3, 3: tangent, side, up) of the rings; vertices and unit normals (R, C, 3), normals
-    pointing into the lumen; radius (R,) the mean radius of each ring."""
+    pointing into the lumen; radius (R,) the mean radius of each ring, polyps aside; step the grid spacing."""
 
     centers: np.ndarray
     frames: np.ndarray
@@ -37,6 +45,7 @@ class TubeShape:
     normals: np.ndarray
     radius: np.ndarray
     step: float
+    polyps: tuple[Polyp, ...] = ()
 
     @property
     def faces(self) -> np.ndarray:
@@ -55,7 +64,11 @@ def smooth_noise(shape: tuple[int, int], sigma: tuple[float, float], rng: np.ran
 
 
 def make_shape(config: ShapeConfig, rng: np.random.Generator) -> TubeShape:
-    """A random colon. The far end is closed, so that every ray into the scene meets the wall."""
+    """A random colon. The far end is closed, so that every ray into the scene meets the wall.
+
+    Shapes of before the later effects (from `crescent` on) stay as they were: those draw from generators of their own.
+    """
+    fold_rng, polyp_rng = rng.spawn(2)
     rings = round(config.length / config.step) + 1
     s = np.arange(rings) * config.step
     mean_radius = rng.uniform(*config.radius)
@@ -68,7 +81,9 @@ def make_shape(config: ShapeConfig, rng: np.random.Generator) -> TubeShape:
     relative = profile[:, None] * np.ones(spokes)
     sigma = 5.0 / config.step
     relative += rng.uniform(*config.bump) * smooth_noise((rings, spokes), (sigma, sigma), rng)
-    relative -= _folds(s, phi, config, rng)
+    folds, taenia = _folds(s, phi, config, rng, fold_rng)
+    relative -= folds
+    relative -= fold_rng.uniform(*config.taeniae) * _bands(phi, taenia)
 
     # Close the far end with a half ellipse.
     end = 0.6 * mean_radius
@@ -78,13 +93,22 @@ def make_shape(config: ShapeConfig, rng: np.random.Generator) -> TubeShape:
 
     side = np.cos(phi)[:, None] * frames[:, None, 1] + np.sin(phi)[:, None] * frames[:, None, 2]
     vertices = centers[:, None] + radius[..., None] * side
+    polyps = draw_polyps(radius, config.step, config.polyps, config.polyp_radius, config.stalked, polyp_rng)
+    normals = _normals(vertices, side)
+    if polyps:
+        vertices = raised(vertices, normals, polyps)
+        normals = _normals(vertices, side)
+    return TubeShape(centers, frames, vertices, normals, radius.mean(1), config.step, polyps)
+
+
+def _normals(vertices: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Unit normals (R, C, 3) of the grid, into the lumen; side (R, C, 3) points outwards."""
     along_s = np.gradient(vertices, axis=0)
     wrapped = np.concatenate([vertices[:, -1:], vertices, vertices[:, :1]], 1)
     along_phi = (wrapped[:, 2:] - wrapped[:, :-2]) / 2
     normals = np.cross(along_s, along_phi)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-12)
-    inward = np.sign((normals * -side).sum(-1).mean())
-    return TubeShape(centers, frames, vertices, normals * inward, radius.mean(1), config.step)
+    return normals * np.sign((normals * -side).sum(-1).mean())
 
 
 def _centreline(s: np.ndarray, swing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -104,12 +128,16 @@ def _centreline(s: np.ndarray, swing: float, rng: np.random.Generator) -> tuple[
     return centers, np.stack([tangent, side, np.cross(tangent, side)], 1)
 
 
-def _folds(s: np.ndarray, phi: np.ndarray, config: ShapeConfig, rng: np.random.Generator) -> np.ndarray:
-    """How far the folds reach into the lumen, as a share of the radius (R, C).
+def _folds(
+    s: np.ndarray, phi: np.ndarray, config: ShapeConfig, rng: np.random.Generator, own: np.random.Generator
+) -> tuple[np.ndarray, float]:
+    """How far the folds reach into the lumen, as a share of the radius (R, C), and the angle of a taenia's opposite.
 
-    Each is a ring of narrow profile, tilted, and strong between the three taeniae, weak on them.
+    Each is a ring of narrow profile, tilted, and strong between the three taeniae, weak on them. `own` draws what
+    makes it a crescent and its course wavy.
     """
     total = np.zeros((len(s), len(phi)))
+    crescent, waviness = own.uniform(*config.crescent), own.uniform(*config.waviness)
     taenia = rng.uniform(0, 2 * np.pi)
     position = rng.uniform(2, 10)
     while position < s[-1]:
@@ -118,7 +146,27 @@ def _folds(s: np.ndarray, phi: np.ndarray, config: ShapeConfig, rng: np.random.G
         one_sided = 1 + 0.35 * np.cos(phi - rng.uniform(0, 2 * np.pi))
         depth = rng.uniform(*config.fold_depth) * lobes * one_sided
         width = rng.uniform(*config.fold_width)
-        offset = (s[:, None] - position - tilt) / width
+        if crescent > 0:
+            depth *= 1 - crescent + crescent * _by_third(own.uniform(0, 1.3, 3), phi - taenia)
+        waves = waviness * _waves(phi, own)
+        offset = (s[:, None] - position - tilt - waves) / width
         total = np.maximum(total, depth * np.exp(-(np.abs(offset) ** 1.6)))
         position += rng.uniform(*config.fold_spacing)
-    return total
+    return total, taenia
+
+
+def _by_third(weights: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    """One of three weights around each of the angles 0, 120 and 240 degrees, blended between them."""
+    near = np.exp(4 * np.cos(phi[:, None] - np.arange(3) * 2 * np.pi / 3))
+    return near @ weights / near.sum(1)
+
+
+def _waves(phi: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A periodic curve of unit deviation."""
+    wave = sum(rng.normal(0, 1 / k) * np.cos(k * phi - rng.uniform(0, 2 * np.pi)) for k in (2, 3, 4, 6))
+    return np.asarray(wave) / 0.86
+
+
+def _bands(phi: np.ndarray, taenia: float) -> np.ndarray:
+    """1 along the three taeniae, half-way between the strong parts of the folds, 0 apart from them. (C,)"""
+    return np.exp(6 * (np.cos(3 * (phi - taenia) + np.pi) - 1) / 2)

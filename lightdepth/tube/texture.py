@@ -21,14 +21,20 @@ class TextureConfig:
     value: tuple[float, float] = (0.0, 0.12)  # how much darker the darkest spots are: what LightDepth assumes to be 0
     vessels: tuple[int, int] = (10, 45)
     resolution: float = 0.14  # mm per texel along s
+    vessel_width: tuple[float, float] = (0.25, 0.7)  # mm, of the stems
+    vessel_value: tuple[float, float] = (0.0, 0.0)  # how much darker vessels are than the wall
+    vessel_strength: tuple[float, float] = (1.0, 1.0)  # how well they show
+    blotches: tuple[float, float] = (0.0, 0.0)  # how much more saturated inflamed patches are
+    speckle: tuple[float, float] = (0.0, 0.0)  # deviation of saturation at the scale of mucosal pits, 0.3 mm
 
 
 def make_texture(length: float, circumference: float, config: TextureConfig, rng: np.random.Generator) -> np.ndarray:
     """Albedo (rows along s, columns along phi, 3) float32 RGB in [0, 1]."""
+    vessel_rng, blotch_rng, speckle_rng = rng.spawn(3)
     rows, columns = round(length / config.resolution), round(circumference / config.resolution)
     coarse = (rows // 6, columns // 6)
 
-    def noise(scale_mm: float) -> np.ndarray:
+    def noise(scale_mm: float, rng: np.random.Generator = rng) -> np.ndarray:
         sigma = scale_mm / config.resolution / 6
         field = smooth_noise(coarse, (sigma, sigma), rng).astype(np.float32)
         padded = np.concatenate([field, field[:, :1]], 1)
@@ -43,8 +49,19 @@ def make_texture(length: float, circumference: float, config: TextureConfig, rng
     value = 1 - darker * np.clip(0.5 + 0.35 * noise(3), 0, 1)
 
     vessels = _vessels((rows, columns), int(rng.integers(config.vessels[0], config.vessels[1] + 1)), config, rng)
-    saturation = np.clip(saturation + 0.25 * vessels, 0.02, 0.95)
+    vessels *= vessel_rng.uniform(*config.vessel_strength)
+    saturation = saturation + 0.25 * vessels
+    blotches = blotch_rng.uniform(*config.blotches)
+    if blotches > 0:
+        saturation += blotches * np.clip(noise(2.5, blotch_rng) + 0.5 * noise(0.9, blotch_rng) - 0.8, 0, 1.5)
+    speckle = speckle_rng.uniform(*config.speckle)
+    if speckle > 0:
+        grain = gaussian_filter(speckle_rng.standard_normal((256, 256)).astype(np.float32), 0.9, mode="wrap")
+        tiles = np.tile(grain / grain.std(), (rows // 256 + 1, columns // 256 + 1))
+        saturation += speckle * tiles[:rows, :columns]
+    saturation = np.clip(saturation, 0.02, 0.95)
     value = value * (1 - 0.25 * vessels * min(1.0, darker * 10))
+    value = value * (1 - vessel_rng.uniform(*config.vessel_value) * vessels)
     hsv = np.stack([(hue % 1.0) * 360, saturation, value], -1).astype(np.float32)
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)
 
@@ -55,7 +72,7 @@ def _vessels(shape: tuple[int, int], count: int, config: TextureConfig, rng: np.
     canvas = np.zeros(shape, np.float32)
     step = 0.8 / config.resolution
     stems = [
-        (rng.uniform(0, rows), rng.uniform(0, columns), rng.uniform(0, 2 * np.pi), rng.uniform(0.25, 0.7), 0)
+        (rng.uniform(0, rows), rng.uniform(0, columns), rng.uniform(0, 2 * np.pi), rng.uniform(*config.vessel_width), 0)
         for _ in range(count)
     ]
     while stems:
