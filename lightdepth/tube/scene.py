@@ -33,6 +33,7 @@ class TubeConfig:
     texture: TextureConfig = field(default_factory=TextureConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     film: FilmConfig = field(default_factory=FilmConfig)
+    least_cosine: float = 0.0  # normals interpolated across a fold's edge may look away: no further than this; 0 as is
 
 
 def realistic() -> TubeConfig:
@@ -52,7 +53,7 @@ def realistic() -> TubeConfig:
         ),
         TextureConfig(
             hue=(-0.01, 0.055),
-            saturation=(0.35, 0.75),
+            saturation=(0.45, 0.8),
             value=(0.0, 0.15),
             vessels=(5, 60),
             vessel_width=(0.15, 0.6),
@@ -63,17 +64,17 @@ def realistic() -> TubeConfig:
         ),
         SensorConfig(
             gamma=(1.8, 2.6),
-            mu=(1.6, 3.4),
+            mu=(1.4, 3.3),
             reflectance=(0.0, 0.7),
             specular=(0.0, 0.5),
             bright_share=(0.01, 0.35),
             shoulder=(0.7, 1.0),
             exposure=(0.05, 0.2),
-            cosine_exponent=(0.6, 1.0),
+            cosine_exponent=(0.8, 1.15),
             gloss=(30.0, 200.0),
             roughness=(0.02, 0.12),
             sparkle=(0.0, 0.3),
-            vignetting=(0.0, 0.5),
+            vignetting=(0.0, 0.4),
             glare=(0.0, 0.06),
             bloom=(0.0, 0.15),
             motion=(0.0, 0.008),
@@ -85,6 +86,7 @@ def realistic() -> TubeConfig:
             jpeg=(60, 100),
         ),
         FilmConfig(mucus=(0.0, 0.35), bubbles=(0, 4), stool=(0, 12)),
+        least_cosine=0.08,
     )
 
 
@@ -104,10 +106,10 @@ class Tube:
     def __init__(self, config: TubeConfig, rng: np.random.Generator, light: PhotometricCalibration | None = None):
         o3d = native.open3d()
         film_rng, surface_rng, sensor_rng, tint_rng = rng.spawn(4)
-        self.shape: TubeShape = make_shape(config.shape, rng)
+        self.shape: TubeShape = self._make_shape(config.shape, rng)
         rings, spokes = self.shape.vertices.shape[:2]
         circumference = 2 * np.pi * float(self.shape.radius.mean())
-        albedo = make_texture(rings * self.shape.step, circumference, config.texture, rng)
+        albedo = self._make_texture(rings * self.shape.step, circumference, config.texture, rng)
         albedo = tinted(albedo, self.shape.polyps, self.shape.radius, spokes, self.shape.step, tint_rng)
         self.albedo, self.film = cover(albedo, config.texture.resolution, config.film, film_rng)
         self._bumps = [smooth_noise((rings * 2, spokes * 2), (0.9, 0.9), rng).astype(np.float32) for _ in range(2)]
@@ -127,7 +129,12 @@ class Tube:
         self._scene.add_triangles(
             self._tensor(self.shape.vertices.reshape(-1, 3)), o3d.core.Tensor(self.shape.faces.astype(np.uint32))
         )
+        self._least_cosine = config.least_cosine
         self._patches = self._make_patches()
+
+    _make_shape = staticmethod(make_shape)
+    _make_texture = staticmethod(make_texture)
+    _expose = staticmethod(expose)
 
     def view(self, world_from_cam: np.ndarray, camera: CameraModel, mask: np.ndarray, rng: np.random.Generator) -> View:
         """What the endoscope sees from a pose (4, 4) [mm]; pixels outside mask (H, W) are black."""
@@ -144,6 +151,10 @@ class Tube:
         normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-9) @ world_from_cam[:3, :3]
         rows, columns = wanted.nonzero()
         index = (rows[met], columns[met])
+        if self._least_cosine > 0:
+            lacking = (self._least_cosine + (normals * rays[index]).sum(-1)).clip(min=0)
+            normals = normals - lacking[:, None] * rays[index]
+            normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         distance = np.zeros(mask.shape, np.float32)
         distance[index] = t[met]
         all_normals = np.zeros((*mask.shape, 3), np.float32)
@@ -151,7 +162,7 @@ class Tube:
         linear = np.zeros((*mask.shape, 3))
         linear[index] = self._shade(t[met], normals, rays[index], ring, spoke, world_from_cam)
         flow = image_flow(distance, camera, self.sensor.motion, own) if self.sensor.motion > 0 else None
-        image = expose(linear, distance > 0, rays[..., 2], flow, self.sensor, rng, own)
+        image = self._expose(linear, distance > 0, rays[..., 2], flow, self.sensor, rng, own)
         return View(image, distance, all_normals)
 
     def distance_to_wall(self, points: np.ndarray) -> np.ndarray:

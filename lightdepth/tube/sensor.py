@@ -30,7 +30,10 @@ class SensorConfig:
     shoulder: tuple[float, float] = (0.75, 1.0)  # code value at which the tone curve starts to bend
     noise: tuple[float, float] = (0.003, 0.012)  # deviation in code values
     exposure: tuple[float, float] = (0.1, 0.1)  # deviation of log gain from frame to frame
-    cosine_exponent: tuple[float, float] = (1.0, 1.0)  # 1 is Lambert; rougher walls have less (Minnaert: 2k - 1)
+    cosine_exponent: tuple[float, float] = (
+        1.0,
+        1.0,
+    )  # 1 is Lambert; rough walls have less, satin ones more (Minnaert: 2k - 1)
     gloss: tuple[float, float] = (60.0, 60.0)  # exponent of the highlights' lobe
     roughness: tuple[float, float] = (0.1, 0.1)  # slopes that break up the highlights
     sparkle: tuple[float, float] = (0.0, 0.0)  # slopes of the finest relief, tenths of a millimetre

@@ -30,11 +30,12 @@ def render_sequence(
     config: TubeConfig | None = None,
     light: PhotometricCalibration | None = None,
     progress: Callable[[int, int], None] | None = None,
+    kind: type[Tube] = Tube,
 ) -> TubeSequence:
     """A colon drawn from `seed`, seen in `count` frames along `travel` mm. Frames carry the light's true calibration
     with gain 1 (exposure is automatic, so the true gain differs per frame), distance and pose in mm."""
     rng = np.random.default_rng(seed)
-    tube = Tube(config or TubeConfig(), rng, light)
+    tube = kind(config or TubeConfig(), rng, light)
     mask = octagon(camera)
     frames = []
     for i, pose in enumerate(camera_path(tube.shape, count, travel, rng)):

@@ -75,7 +75,7 @@ def make_shape(config: ShapeConfig, rng: np.random.Generator) -> TubeShape:
     spokes = 8 * round(2 * np.pi * mean_radius / config.step / 8)
     phi = np.arange(spokes) * 2 * np.pi / spokes
 
-    centers, frames = _centreline(s, rng.uniform(*config.bend), rng)
+    centers, frames = _wandering(s, rng.uniform(*config.bend), rng)
     profile = 1 + 0.12 * np.interp(s, np.linspace(0, config.length, 6), rng.standard_normal(6))
     profile = gaussian_filter(profile, 8 / config.step)
     relative = profile[:, None] * np.ones(spokes)
@@ -85,20 +85,29 @@ def make_shape(config: ShapeConfig, rng: np.random.Generator) -> TubeShape:
     relative -= folds
     relative -= fold_rng.uniform(*config.taeniae) * _bands(phi, taenia)
 
-    # Close the far end with a half ellipse.
-    end = 0.6 * mean_radius
-    closing = np.sqrt(np.clip(1 - ((s - (config.length - end)) / end).clip(min=0) ** 2, 0, 1))
-    relative = relative.clip(min=0.3) * np.maximum(closing, 1e-3)[:, None]
-    radius = mean_radius * relative
+    radius = mean_radius * closed(relative.clip(min=0.3), 0.6 * mean_radius, s, config.length)
+    polyps = draw_polyps(radius, config.step, config.polyps, config.polyp_radius, config.stalked, polyp_rng)
+    return swept(radius, centers, frames, config.step, polyps)
 
+
+def swept(
+    radius: np.ndarray, centers: np.ndarray, frames: np.ndarray, step: float, polyps: tuple[Polyp, ...] = ()
+) -> TubeShape:
+    """The shape of a wall at radius (R, C) [mm] from a centreline: centers (R, 3), frames (R, 3, 3)."""
+    phi = np.arange(radius.shape[1]) * 2 * np.pi / radius.shape[1]
     side = np.cos(phi)[:, None] * frames[:, None, 1] + np.sin(phi)[:, None] * frames[:, None, 2]
     vertices = centers[:, None] + radius[..., None] * side
-    polyps = draw_polyps(radius, config.step, config.polyps, config.polyp_radius, config.stalked, polyp_rng)
     normals = _normals(vertices, side)
     if polyps:
         vertices = raised(vertices, normals, polyps)
         normals = _normals(vertices, side)
-    return TubeShape(centers, frames, vertices, normals, radius.mean(1), config.step, polyps)
+    return TubeShape(centers, frames, vertices, normals, radius.mean(1), step, polyps)
+
+
+def closed(relative: np.ndarray, end: float, s: np.ndarray, length: float) -> np.ndarray:
+    """Radii (R, C) at s (R,) that close at `length` with a half ellipse, `end` mm long."""
+    closing = np.sqrt(np.clip(1 - ((s - (length - end)) / end).clip(min=0) ** 2, 0, 1))
+    return relative * np.maximum(closing, 1e-3)[:, None]
 
 
 def _normals(vertices: np.ndarray, side: np.ndarray) -> np.ndarray:
@@ -111,11 +120,16 @@ def _normals(vertices: np.ndarray, side: np.ndarray) -> np.ndarray:
     return normals * np.sign((normals * -side).sum(-1).mean())
 
 
-def _centreline(s: np.ndarray, swing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _wandering(s: np.ndarray, swing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """A smooth curve by arc length with parallel-transported frames."""
     knots = np.linspace(s[0], s[-1], 5)
     angles = [gaussian_filter(np.interp(s, knots, swing * rng.uniform(-1, 1, 5)), len(s) / 12) for _ in range(2)]
-    yaw, pitch = (a - a[0] for a in angles)
+    return centreline(s, angles[0], angles[1])
+
+
+def centreline(s: np.ndarray, yaw: np.ndarray, pitch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The curve (R, 3) that leaves the origin along z and turns by yaw and pitch (R,), with frames (R, 3, 3)."""
+    yaw, pitch = yaw - yaw[0], pitch - pitch[0]
     tangent = np.stack([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)], -1)
     step = s[1] - s[0]
     centers = np.concatenate([[np.zeros(3)], np.cumsum((tangent[1:] + tangent[:-1]) / 2 * step, 0)])
