@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning.pytorch as pl
 import numpy as np
@@ -24,6 +24,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import Frame, FrameBatch, to_batch
 from lightdepth.photometry import LightTerms, decode, encode
 from lightdepth.progress import Progress
+from lightdepth.tube.scene import TubeConfig
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class TubeData:
         mu: ends of the range of the light's spread.
         gamma: ends of the range of the response.
         reflectance: ends of the range of the wall's reflectance.
+        family: plain, or realistic: polyps, mucus, motion blur and all else (lightdepth.tube.realistic).
+        scene: ranges of one's own instead of the family's; mu, gamma and reflectance above hold in any case.
     """
 
     scenes: int = 0
@@ -49,6 +52,8 @@ class TubeData:
     mu: tuple[float, float] = (0.0, 3.5)
     gamma: tuple[float, float] = (1.8, 2.6)
     reflectance: tuple[float, float] = (0.0, 0.7)
+    family: Literal["plain", "realistic"] = "plain"
+    scene: TubeConfig | None = None
 
 
 _NO_TUBE = TubeData()
@@ -233,10 +238,10 @@ def augmented(batch: FrameBatch, generator: torch.Generator) -> FrameBatch:
 
 def tube_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> list[FrameBatch]:
     """The frames of one synthetic colon, as batches of one."""
-    from lightdepth.tube import TubeConfig, lens, tube_frames
+    from lightdepth.tube import lens, realistic, tube_frames
 
     camera = lens(tube.lenses[index % len(tube.lenses)], *size)
-    config = TubeConfig()
+    config = tube.scene or (realistic() if tube.family == "realistic" else TubeConfig())
     config = replace(config, sensor=replace(config.sensor, mu=tube.mu, gamma=tube.gamma, reflectance=tube.reflectance))
     return [to_batch(f, size) for f in tube_frames(seed, tube.frames, camera, travel=tube.travel, config=config)]
 

@@ -1,10 +1,12 @@
 """The synthetic colon: shape, texture, light and camera path -> frames and a SLAM export with exact truth."""
 
+from lightdepth.tube.film import FilmConfig
 from lightdepth.tube.path import camera_path, lens, octagon
-from lightdepth.tube.scene import SensorConfig, ShapeConfig, TextureConfig, Tube, TubeConfig
+from lightdepth.tube.scene import SensorConfig, ShapeConfig, TextureConfig, Tube, TubeConfig, realistic
 from lightdepth.tube.sequence import TubeSequence, render_sequence, tube_frames
 
 __all__ = [
+    "FilmConfig",
     "SensorConfig",
     "ShapeConfig",
     "TextureConfig",
@@ -14,6 +16,7 @@ __all__ = [
     "camera_path",
     "lens",
     "octagon",
+    "realistic",
     "render_sequence",
     "tube_frames",
 ]

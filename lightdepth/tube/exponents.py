@@ -79,7 +79,9 @@ def fit_exponents(
     terms = np.stack([np.log(distance[use]), np.log(cosine[use]), rays[use][:, 2] - 1, np.ones(len(value))], -1)
     solution = np.linalg.lstsq(terms, value, rcond=None)[0]
     left = value - terms @ solution
-    return Exponents(*map(float, solution[:3]), float(1 - left.var() / max(value.var(), 1e-12)), len(value))
+    by_distance, by_cosine, by_spread = (float(x) for x in solution[:3])
+    explained = float(1 - left.var() / max(value.var(), 1e-12))
+    return Exponents(by_distance, by_cosine, by_spread, explained, len(value))
 
 
 def scene_exponents(

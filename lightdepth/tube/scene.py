@@ -3,8 +3,8 @@
 A view has: direct light from a spot beside the camera, light from the wall to the wall (radiosity between patches of
 the whole tube with true occlusion: not the approximation that the losses use), highlights on wet and rough wall, and
 what lightdepth.tube.sensor makes of it. Lengths in millimetres; images (H, W, 3); patches are a coarse grid over
-(s, phi). Every effect beyond the first colons' draws from a generator of its own, so that switching one on or off
-changes nothing else.
+(s, phi). Every effect beyond the first colons' draws from a generator of its own: on or off, the rest stays the same
+(but a wall of another circumference needs another sheet of paint).
 """
 
 from __future__ import annotations
@@ -118,8 +118,7 @@ class Tube:
         if light is not None:
             self.light = replace(light, reflectance=light.reflectance or self.light.reflectance)
         self.specular = rng.uniform(*sensor.specular)
-        older = [rng.uniform(*ends) for ends in (sensor.bright_share, sensor.shoulder, sensor.noise)]
-        self.sensor = draw_sensor(sensor, self.light.gamma, *older, sensor_rng)
+        self.sensor = draw_sensor(sensor, self.light.gamma, rng, sensor_rng)
         self.cosine_exponent = surface_rng.uniform(*sensor.cosine_exponent)
         self.gloss, self.roughness = surface_rng.uniform(*sensor.gloss), surface_rng.uniform(*sensor.roughness)
         self.sparkle = surface_rng.uniform(*sensor.sparkle)

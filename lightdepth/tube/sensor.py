@@ -70,28 +70,29 @@ class Sensor:
     jpeg: int
 
 
-def draw_sensor(
-    config: SensorConfig, gamma: float, bright_share: float, shoulder: float, noise: float, rng: np.random.Generator
-) -> Sensor:
-    """The camera of one endoscope; what is older than the other effects was drawn before."""
-    deviation = rng.uniform(*config.cast)
-    cast = np.exp(deviation * rng.standard_normal(3))
+def draw_sensor(config: SensorConfig, gamma: float, rng: np.random.Generator, own: np.random.Generator) -> Sensor:
+    """The camera of one endoscope; `rng` draws exposure, shoulder and noise, `own` what came later."""
+    bright_share, shoulder, noise = (
+        rng.uniform(*ends) for ends in (config.bright_share, config.shoulder, config.noise)
+    )
+    deviation = own.uniform(*config.cast)
+    cast = np.exp(deviation * own.standard_normal(3))
     return Sensor(
         gamma=gamma,
         bright_share=bright_share,
         shoulder=shoulder,
         noise=noise,
-        exposure=rng.uniform(*config.exposure),
-        vignetting=rng.uniform(*config.vignetting),
-        glare=rng.uniform(*config.glare),
-        bloom=rng.uniform(*config.bloom),
-        motion=rng.uniform(*config.motion),
-        defocus=rng.uniform(*config.defocus),
+        exposure=own.uniform(*config.exposure),
+        vignetting=own.uniform(*config.vignetting),
+        glare=own.uniform(*config.glare),
+        bloom=own.uniform(*config.bloom),
+        motion=own.uniform(*config.motion),
+        defocus=own.uniform(*config.defocus),
         cast=tuple(cast / cast.max()),
-        contrast=rng.uniform(*config.contrast),
-        shot_noise=rng.uniform(*config.shot_noise),
-        sharpen=rng.uniform(*config.sharpen),
-        jpeg=int(rng.integers(config.jpeg[0], config.jpeg[1] + 1)),
+        contrast=own.uniform(*config.contrast),
+        shot_noise=own.uniform(*config.shot_noise),
+        sharpen=own.uniform(*config.sharpen),
+        jpeg=int(own.integers(config.jpeg[0], config.jpeg[1] + 1)),
     )
 
 
@@ -188,4 +189,6 @@ def _moved(linear: np.ndarray, flow: np.ndarray, poses: int = 7) -> np.ndarray:
 def _compressed(image: np.ndarray, quality: int) -> np.ndarray:
     options = [cv2.IMWRITE_JPEG_QUALITY, quality]  # OpenCV halves the chroma of colour images
     packed = cv2.imencode(".jpg", (image[..., ::-1] * 255).astype(np.uint8), options)[1]
-    return cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float32) / 255
+    unpacked = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+    assert unpacked is not None
+    return unpacked[..., ::-1].astype(np.float32) / 255

@@ -105,7 +105,8 @@ def swept(
 
 
 def closed(relative: np.ndarray, end: float, s: np.ndarray, length: float) -> np.ndarray:
-    """Radii (R, C) at s (R,) that close at `length` with a half ellipse, `end` mm long."""
+    """Radii (R, C) at s (R,) that close at `length`, or at the last ring, with a half ellipse, `end` mm long."""
+    length = min(length, float(s[-1]))
     closing = np.sqrt(np.clip(1 - ((s - (length - end)) / end).clip(min=0) ** 2, 0, 1))
     return relative * np.maximum(closing, 1e-3)[:, None]
 

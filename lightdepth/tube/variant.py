@@ -42,7 +42,7 @@ def variant_frames(
     """
     if strength not in REFLECTANCE:
         raise InputError(f"strength {strength!r}; expected weak or strong")
-    config = TubeConfig(sensor=SensorConfig(reflectance=REFLECTANCE[strength]))
+    config = TubeConfig(sensor=SensorConfig(reflectance=REFLECTANCE[strength]), least_cosine=0.05)
     frames = render_sequence(seed, count, camera, travel, config, kind=VariantTube).frames
     return [replace(frame, name=f"variant{seed}_{frame.name}") for frame in frames]
 
