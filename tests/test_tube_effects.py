@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 import pytest
+import torch
 from colons import CAMERA, SMALL
+from jsonargparse import ArgumentError, ArgumentParser
 
 from lightdepth.datasets import read_c3vd
 from lightdepth.errors import InputError
@@ -16,6 +19,7 @@ from lightdepth.tube.exponents import REAL_RANGES, fit_exponents, scene_exponent
 from lightdepth.tube.path import image_flow
 from lightdepth.tube.sensor import SensorConfig, draw_sensor, expose
 from lightdepth.tube.variant import REFLECTANCE, VariantTube, variant_frames
+from train.datamodule import FrameDataModule, TubeData, tube_scene
 
 SENSOR_EFFECTS = {
     "exposure": (0.4, 0.4),
@@ -102,6 +106,20 @@ def test_the_effects_cover_every_field_of_the_configuration_that_can_be_off():
         off = {k for k, v in vars(plain).items() if isinstance(v, tuple) and v[0] == v[1]}
         assert off - {"exposure"} <= known
         assert all(getattr(config, k) != getattr(plain, k) for k in off)  # and realistic colons have them all
+
+
+def test_a_training_configuration_names_the_family_of_its_colons_or_their_ranges():
+    def tube(given: dict) -> TubeData:
+        parser = ArgumentParser(exit_on_error=False)
+        parser.add_class_arguments(FrameDataModule, "data")
+        return parser.instantiate(parser.parse_object({"data": {"tube": {"frames": 1, **given}}})).data.tube
+
+    glare = {"scene": {"sensor": {"glare": [0.2, 0.3]}, "texture": {"resolution": 0.4}, "shape": {"step": 1.2}}}
+    assert tube(glare).scene.sensor.glare == (0.2, 0.3) and tube({}).scene is None
+    images = [tube_scene(tube(given), 4, 0, (60, 48))[0].image for given in ({}, {"family": "realistic"}, glare)]
+    assert not any(torch.equal(a, b) for a, b in combinations(images, 2))
+    with pytest.raises(ArgumentError, match="family"):
+        tube({"family": "fancy"})
 
 
 def test_polyps_stand_in_the_lumen_on_a_wall_that_stays_closed():
