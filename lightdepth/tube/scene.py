@@ -33,6 +33,7 @@ class TubeConfig:
     texture: TextureConfig = field(default_factory=TextureConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     film: FilmConfig = field(default_factory=FilmConfig)
+    patch: float = 3.5  # mm along s, of the patches that light each other
     least_cosine: float = 0.0  # normals interpolated across a fold's edge may look away: no further than this; 0 as is
 
 
@@ -55,7 +56,7 @@ def realistic() -> TubeConfig:
             hue=(-0.01, 0.055),
             saturation=(0.45, 0.8),
             value=(0.0, 0.15),
-            vessels=(5, 60),
+            vessels=(5, 40),
             vessel_width=(0.15, 0.6),
             vessel_value=(0.0, 0.3),
             vessel_strength=(0.2, 1.0),
@@ -63,8 +64,8 @@ def realistic() -> TubeConfig:
             speckle=(0.0, 0.03),
         ),
         SensorConfig(
-            gamma=(1.8, 2.6),
-            mu=(1.4, 3.3),
+            gamma=(1.7, 2.6),
+            mu=(1.3, 3.6),
             reflectance=(0.0, 0.7),
             specular=(0.0, 0.5),
             bright_share=(0.01, 0.35),
@@ -86,6 +87,7 @@ def realistic() -> TubeConfig:
             jpeg=(60, 100),
         ),
         FilmConfig(mucus=(0.0, 0.35), bubbles=(0, 4), stool=(0, 12)),
+        patch=4.4,
         least_cosine=0.08,
     )
 
@@ -128,7 +130,7 @@ class Tube:
         self._scene.add_triangles(
             self._tensor(self.shape.vertices.reshape(-1, 3)), o3d.core.Tensor(self.shape.faces.astype(np.uint32))
         )
-        self._least_cosine = config.least_cosine
+        self._least_cosine, self._patch = config.least_cosine, config.patch
         self._patches = self._make_patches()
 
     _make_shape = staticmethod(make_shape)
@@ -252,7 +254,7 @@ class Tube:
 
     def _make_patches(self) -> _Patches:
         rings, spokes = self.shape.vertices.shape[:2]
-        n_s, n_phi = max(8, round(rings * self.shape.step / 3.5)), 22
+        n_s, n_phi = max(8, round(rings * self.shape.step / self._patch)), 22
         r = np.linspace(0, rings - 1, n_s)
         p = np.arange(n_phi) * spokes / n_phi
         ring, spoke = (a.ravel() for a in np.meshgrid(r, p, indexing="ij"))
