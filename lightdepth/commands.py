@@ -27,7 +27,7 @@ from lightdepth.progress import Progress
 from lightdepth.run import plain, run_folder
 from lightdepth.tube import lens as tube_lens
 from lightdepth.tube import render_sequence
-from lightdepth.tube.scene import TubeConfig
+from lightdepth.tube.scene import TubeConfig, realistic
 from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
 
 
@@ -41,6 +41,7 @@ def synth(
     travel_mm: float = 30.0,
     spurious: float | None = None,
     light: str | None = None,
+    family: Literal["plain", "realistic"] = "plain",
     scene: TubeConfig = TubeConfig(),
     slam: SlamConfig = SlamConfig(),
     overwrite: bool = False,
@@ -57,7 +58,8 @@ def synth(
         travel_mm: length of the path
         spurious: share of wrong map points; left out, slam.spurious
         light: light.json or gamma=2.2,mu=0 to have instead of a drawn one
-        scene: ranges of shape, texture and sensor
+        family: plain (the tube, its folds and its light) or realistic (with all that real images have)
+        scene: ranges of shape, texture and sensor of plain colons
         slam: quality of the simulated SLAM
         overwrite: replace a folder made before
     """
@@ -69,6 +71,9 @@ def synth(
         raise InputError(f"--spurious {slam.spurious}; expected a share of at least 0 and below 1")
     if layout == "endomapper" and lens == "c3vd":
         raise InputError("--layout endomapper holds no Scaramuzza lens, as C3VD's is; add --lens fisheye")
+    if family == "realistic" and scene != TubeConfig():
+        raise InputError("--family realistic has ranges of its own; leave out --scene, or take --family plain")
+    scene = realistic() if family == "realistic" else scene
     chosen = read_light(light) if light is not None else None
     with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", frames) as bar:
         sequence = render_sequence(

@@ -113,6 +113,18 @@ def frames(data, tmp_path_factory) -> Path:
     return folder
 
 
+def test_synth_draws_realistic_colons_too_and_they_have_ranges_of_their_own(tmp_path, capsys):
+    argv = ["--lens", "pinhole", "--frames", 4, "--size", "[64, 48]", "--slam.keyframe_every", 1]
+    for family in ("plain", "realistic"):
+        assert lightdepth("synth", *argv, "--family", family, "-o", tmp_path / family) == 0
+    first, second = (cv2.imread(str(tmp_path / f / "frames" / "000000.png")) for f in ("plain", "realistic"))
+    assert np.abs(first.astype(float) - second).mean() > 5
+    capsys.readouterr()
+    argv += ["--family", "realistic", "--scene.shape.length", 100, "-o", tmp_path / "both"]
+    assert lightdepth("synth", *argv) == 3
+    assert "leave out --scene" in capsys.readouterr().err and not (tmp_path / "both").exists()
+
+
 def test_synth_writes_frames_truth_map_and_what_only_it_knows(data):
     assert {"frames", "truth", "slam", "camera.json", "light.json", "mask.png", "run.json"} <= set(left_in(data))
     assert len(left_in(data / "frames")) == len(left_in(data / "truth" / "distance")) == 8
