@@ -425,6 +425,19 @@ def test_the_map_s_camera_serves_a_folder_without_one_at_any_size(frames, data, 
     assert json.loads((tmp_path / "out" / "map_000" / "camera.json").read_text())["width"] == 192
 
 
+@pytest.mark.parametrize(("layout", "lens"), [("c3vd", "c3vd"), ("endomapper", "fisheye")])
+def test_a_data_set_s_own_tree_is_made_dense_and_trained_on_as_it_is(layout, lens, tmp_path):
+    argv = ["--layout", layout, "--lens", lens, "--frames", 8, "--size", "[100, 80]", "--slam.keyframe_every", 1]
+    assert lightdepth("synth", *argv, *SMALL, "--travel_mm", 10, "-o", tmp_path / "made") == 0
+    sequence, slam = tmp_path / "made" / "sequence", tmp_path / "made" / "slam"
+    assert lightdepth("densify", sequence, "--map", slam, "--checkpoint", "decline", "-o", tmp_path / "dense") == 0
+    record = json.loads((tmp_path / "dense" / "run.json").read_text())
+    assert record["failures"] == [] and (tmp_path / "dense" / "map_001" / "mesh.ply").exists()
+    argv = ["--data.sequences", f"[{sequence}]", "--data.size", "[40, 32]", "--model.network.width", 8]
+    assert lightdepth("train", *argv, "--trainer.max_steps", 2, "-o", tmp_path / "trained") == 0
+    assert json.loads((tmp_path / "trained" / "run.json").read_text())["frames"] == {"train": 7, "val": 1}
+
+
 def test_doctor_finds_nothing_wrong_here(capsys):
     assert lightdepth("doctor") == 0
     shown = capsys.readouterr().out
