@@ -167,6 +167,20 @@ def test_text_on_moving_tissue_is_found_and_hardly_anything_else(color, codec, t
     assert wrong.sum() <= 0.02 * OCTAGON.sum()
 
 
+@pytest.mark.parametrize("place", [(2, 30), (200, 190)], ids=["from the border in", "from the tissue out"])
+def test_letters_on_the_border_go_with_the_line_that_they_belong_to(place, tmp_path):
+    alpha = strokes("PAT 4711", place)
+    across = alpha > 128
+    assert (across & OCTAGON).any() and (across & ~OCTAGON).any()
+    images = [burnt(picture(i), alpha, (255, 255, 255)) for i in range(60)]
+    source = write_video(tmp_path / "a.mkv", images, np.arange(60) / 25, "ffv1", "bgr0")
+    import_frames(source, tmp_path / "out")
+    mask = cv2.imread(str(tmp_path / "out" / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    assert not (mask & across).any() and iou(mask | across, OCTAGON) > 0.9
+    for file in (tmp_path / "out" / "frames").iterdir():
+        assert cv2.imread(str(file))[across].max() < 25, file.name  # the tips of letters, thinner than a pixel
+
+
 def test_where_there_is_no_text_none_is_found():
     images = [picture(i) for i in range(60)]
     assert find_overlay(images, OCTAGON).mask.sum() <= 0.001 * OCTAGON.sum()

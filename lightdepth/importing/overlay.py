@@ -4,8 +4,9 @@ Over some frames of a stretch of the video, text has strong local contrast in th
 out) and hardly any deviation. Digits that count deviate, but their place always has contrast: the boxes around what
 stands still are widened into it. Whole boxes are taken, not strokes: black strokes can be read as well as white ones.
 
-Text that is shown for less than a stretch, while the camera stands still, or on the rim of the tissue alone (2.5 % of
-the height) is not found.
+A line of text that was found goes on over what stands still in its rows: letters on the rim of the tissue go with it.
+Text that is shown for less than a stretch, while the camera stands still, or on the rim alone (2.5 % of the height) is
+not found.
 """
 
 from __future__ import annotations
@@ -37,11 +38,12 @@ def find_overlay(images: Sequence[np.ndarray], tissue: np.ndarray) -> Overlay:
     """Text on and beside `tissue` (H, W) bool, in images (H, W, 3) uint8 in the order of time."""
     count = max(1, min(STRETCHES, len(images) // STRETCH))
     height, width = tissue.shape
-    found, moved = np.zeros(tissue.shape, np.uint8), False
+    found, still, moved = np.zeros(tissue.shape, np.uint8), np.zeros(tissue.shape, bool), False
     for part in np.array_split(np.arange(len(images)), count):
-        enough, text = _static_text([images[i] for i in part], tissue)
+        enough, text, standing = _static_text([images[i] for i in part], tissue)
         moved |= enough
         found = np.maximum(found, text)
+        still |= standing
     line = max(3, round(0.012 * height))
     joined = cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((line, 3 * line), np.uint8))
     mask, boxes = np.zeros(tissue.shape, bool), []
@@ -52,6 +54,7 @@ def find_overlay(images: Sequence[np.ndarray], tissue: np.ndarray) -> Overlay:
             mask |= cv2.dilate((labels == label).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
             boxes.append((int(x), int(y), int(w), int(h)))
             continue
+        x, w = _stretched(still[y : y + h], x, w, h)
         pad = 2 + round(0.15 * h)
         left, top, right, bottom = max(0, x - pad), max(0, y - pad), min(width, x + w + pad), min(height, y + h + pad)
         mask[top:bottom, left:right] = True
@@ -59,8 +62,19 @@ def find_overlay(images: Sequence[np.ndarray], tissue: np.ndarray) -> Overlay:
     return Overlay(mask, moved, boxes)
 
 
-def _static_text(images: Sequence[np.ndarray], tissue: np.ndarray) -> tuple[bool, np.ndarray]:
-    """Whether the tissue moved in images (H, W, 3), and (H, W) uint8, 1 on text and on what counts beside it.
+def _stretched(still: np.ndarray, x: int, w: int, h: int) -> tuple[int, int]:
+    """Place and width of a line of text, over what else stands still in its rows (h, W): letters on the rim."""
+    left, right = x, x + w
+    while (more := np.flatnonzero(still[:, max(0, left - h) : left].any(0))).size:
+        left = max(0, left - h) + int(more[0])
+    while (more := np.flatnonzero(still[:, right : right + h].any(0))).size:
+        right += int(more[-1]) + 1
+    return left, right - left
+
+
+def _static_text(images: Sequence[np.ndarray], tissue: np.ndarray) -> tuple[bool, np.ndarray, np.ndarray]:
+    """Whether the tissue moved in images (H, W, 3); (H, W) uint8, 1 on text and on what counts beside it; and (H, W)
+    bool, all that stands still with sharp edges, the rim of the optic too.
 
     Channels count apart: green text can be as bright as the tissue behind it.
     """
@@ -73,11 +87,12 @@ def _static_text(images: Sequence[np.ndarray], tissue: np.ndarray) -> tuple[bool
     seeds = beside & (mean.max(-1) > _CONTRAST)  # what shines beyond the border is no tissue
     window = np.ones((max(3, round(0.01 * height)) | 1,) * 2, np.uint8)
     motion = float(np.median(deviation.max(-1)[inner])) if len(images) >= 5 and inner.any() else 0.0
-    moved = motion >= MOVING
+    moved, standing = motion >= MOVING, seeds
     if moved:
         still = (deviation < np.minimum(0.3 * motion, 2 + 0.06 * mean.max(-1, keepdims=True))).all(-1)
         contrast = (cv2.dilate(mean, window) - cv2.erode(mean, window)).max(-1) > _CONTRAST
-        seeds |= still & contrast & inner & (mean.max(-1) > 24)
+        standing = seeds | (still & contrast & (mean.max(-1) > 24))
+        seeds = seeds | (standing & inner)
     found = _without_specks(seeds.astype(np.uint8), max(4, round(8e-6 * tissue.size)))
     grown = cv2.dilate(found, np.ones((3, 3), np.uint8))
     if moved and found.any():
@@ -87,7 +102,7 @@ def _static_text(images: Sequence[np.ndarray], tissue: np.ndarray) -> tuple[bool
         reach = cv2.dilate(grown, np.ones((3, max(3, round(0.12 * height)) | 1), np.uint8))
         counting = (always & (reach > 0) & inner).astype(np.uint8)
         grown = np.maximum(grown, cv2.morphologyEx(counting, cv2.MORPH_OPEN, np.ones((5, 3), np.uint8)))
-    return moved, grown
+    return moved, grown, standing
 
 
 def _moments(images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
