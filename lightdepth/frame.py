@@ -126,6 +126,9 @@ def to_batch(frame: Frame, size: tuple[int, int] | None = None) -> FrameBatch:
     if truth is None:
         truth = np.zeros(valid.shape, np.float32)
     true_valid = np.isfinite(truth) & (truth > 0) & valid
+    finite = np.isfinite(image).all(-1)  # images in memory may hold anything
+    if not finite.all():
+        valid, true_valid, image = valid & finite, true_valid & finite, np.where(finite[..., None], image, 0)
     return FrameBatch(
         image=_tensor(image.astype(np.float32, copy=False)),
         mask=_tensor(valid),
@@ -194,3 +197,27 @@ def _merging(many: int, few: int) -> csr_matrix:
     pixels = np.arange(many)
     overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
     return csr_matrix(np.clip(overlap, 0, None).astype(np.float32) * np.float32(few / many))
+
+
+def flipped(batch: FrameBatch, chosen: Tensor, axis: int) -> FrameBatch:
+    """The chosen (B,) bool images in a mirror: axis 0 left for right, axis 1 top for bottom.
+
+    Everything is mirrored, rays and light with the image, so that what is seen stays physically right.
+    """
+    which = chosen.reshape(-1, 1, 1, 1)
+    sign = torch.ones(1, 3, 1, 1, device=batch.image.device)
+    sign[:, axis] = -1
+    sign = torch.where(which, sign, 1.0)
+
+    def mirror(tensor: Tensor) -> Tensor:
+        return torch.where(which, tensor.flip(-1 - axis), tensor)
+
+    light = batch.light._replace(position=batch.light.position * sign, direction=batch.light.direction * sign)
+    return FrameBatch(
+        image=mirror(batch.image),
+        mask=mirror(batch.mask),
+        rays=mirror(batch.rays) * sign,
+        light=light,
+        true_distance=mirror(batch.true_distance),
+        true_valid=mirror(batch.true_valid),
+    )

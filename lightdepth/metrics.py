@@ -7,9 +7,16 @@ Means are over frames.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 from torchmetrics import Metric
+
+from lightdepth.decline import informative
+from lightdepth.frame import FrameBatch, flipped
+from lightdepth.losses import masked_mean, masked_median
+from lightdepth.photometry import brightness, decode, encode
 
 NAMES = ("abs_rel", "rmse_mm", "medae_mm", "delta1")
 
@@ -68,3 +75,21 @@ class DepthErrors(Metric):
     def compute(self) -> dict[str, Tensor]:
         mean = self.total / self.frames
         return {f"{name}_{self.alignment}": value for name, value in zip(NAMES, mean, strict=True)}
+
+
+_EXPOSURE = 0.8
+
+
+@torch.no_grad()
+def inconsistency(model: Callable[[FrameBatch], tuple[Tensor, Tensor]], batch: FrameBatch, distance: Tensor) -> Tensor:
+    """Mean |difference of log t| between `distance` and that of the mirrored, darker batch, free of scale.
+
+    Needs no truth. A model whose answer hangs on exposure or on left and right cannot be right about both.
+    """
+    gamma = batch.light.gamma
+    darker = batch._replace(image=encode(_EXPOSURE * decode(batch.image, gamma), gamma))
+    everyone = torch.ones(len(batch.image), dtype=torch.bool, device=batch.image.device)
+    mirrored = model(flipped(darker, everyone, axis=0))[0].flip(-1)
+    difference = mirrored.log() - distance.log()
+    usable = informative(darker.image, batch.mask) & (brightness(batch.image) < 1)
+    return masked_mean((difference - masked_median(difference, usable)).abs(), usable)

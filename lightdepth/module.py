@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Literal
 
 import lightning.pytorch as pl
 import torch
 from torch import Tensor
-from torch.optim.lr_scheduler import OneCycleLR
+from torch.optim.lr_scheduler import LambdaLR, OneCycleLR
 
 from lightdepth.decline import log_closed_form
+from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch
 from lightdepth.geometry import depth_from_distance
 from lightdepth.losses import LossConfig, self_supervised_loss, training_loss
-from lightdepth.metrics import DepthErrors
-from lightdepth.network import NetworkConfig, build_network
+from lightdepth.metrics import DepthErrors, inconsistency
+from lightdepth.network import Estimate, NetworkConfig, build_network, load_pretrained
+from lightdepth.network.model import full_precision
 
 _NETWORK, _LOSS = NetworkConfig(), LossConfig()
 _MIN_RAY_Z = 0.15  # beyond 81 degrees from the axis, depth says little about distance
+SCHEDULES = ("one_cycle", "cosine", "constant")
 
 
 class _OneCycle(OneCycleLR):
@@ -34,9 +38,13 @@ class LightDepth(pl.LightningModule):
     Args:
         network: which network.
         loss: weights of the loss terms.
-        learning_rate: the highest, in the middle of one cycle.
+        learning_rate: the highest of the schedule.
         weight_decay: of AdamW.
+        schedule: one_cycle (up, then down), cosine (down) or constant.
         rows: image height it is trained at [pixels]; predictions are made at it.
+        pretrained: file of weights that others trained, for the encoder of unet or dpt (.safetensors or .pth).
+        start: checkpoint of ours to start from, by name or path, where its network has the same parts.
+        freeze_distance: only the uncertainty head learns; distance and albedo stay as they start.
     """
 
     def __init__(
@@ -45,17 +53,34 @@ class LightDepth(pl.LightningModule):
         loss: LossConfig = _LOSS,
         learning_rate: float = 2e-3,
         weight_decay: float = 1e-2,
+        schedule: Literal["one_cycle", "cosine", "constant"] = "one_cycle",
         rows: int = 128,
+        pretrained: str | None = None,
+        start: str | None = None,
+        freeze_distance: bool = False,
     ) -> None:
         super().__init__()
         # Lightning hands back the plain values of a checkpoint.
         network = NetworkConfig.from_dict(network) if isinstance(network, dict) else network
         loss = LossConfig(**loss) if isinstance(loss, dict) else loss
-        plain = {"learning_rate": learning_rate, "weight_decay": weight_decay, "rows": rows}
+        if schedule not in SCHEDULES:
+            raise InputError(f"schedule {schedule!r}; expected one of {', '.join(SCHEDULES)}")
+        if not network.uncertainty and (loss.uncertainty > 0 or freeze_distance):
+            raise InputError("the loss trains an uncertainty head that the network has not; set network.uncertainty")
+        plain = {"learning_rate": learning_rate, "weight_decay": weight_decay, "schedule": schedule, "rows": rows}
         self.save_hyperparameters({"network": network.to_dict(), "loss": asdict(loss), **plain}, logger=False)
         self.loss_config = loss
         self.learning_rate, self.weight_decay, self.rows = learning_rate, weight_decay, rows
+        self.schedule, self.freeze_distance = schedule, freeze_distance
         self.network = build_network(network)
+        if pretrained is not None:
+            load_pretrained(self.network, pretrained)
+        if start is not None:
+            self._start_from(start)
+        if freeze_distance:
+            self.network.body.requires_grad_(False)
+        if self.network.uncertainty is not None and loss.uncertainty == 0:
+            self.network.uncertainty.requires_grad_(False)  # DDP waits for every gradient
         self.errors = DepthErrors("median")
         self.closed_form_errors = DepthErrors("median")
 
@@ -63,16 +88,26 @@ class LightDepth(pl.LightningModule):
         """Distance (B, 1, H, W) and albedo as hue and saturation (B, 2, H, W)."""
         return self.network(batch.image, batch.mask, batch.rays, batch.light)
 
-    def training_step(self, batch: FrameBatch, batch_idx: int) -> Tensor:
-        distance, albedo_hs = self(batch)
-        total, terms = training_loss(distance, albedo_hs, batch, self.loss_config)
+    def estimate(self, batch: FrameBatch) -> Estimate:
+        """Distance, albedo and uncertainty."""
+        return self.network.estimate(batch.image, batch.mask, batch.rays, batch.light)
+
+    def training_step(self, batch: FrameBatch, batch_idx: int) -> dict[str, Any]:
+        if self.freeze_distance:
+            self.network.body.eval()
+        distance, albedo_hs, log_sigma = self.estimate(batch)
+        with full_precision(self.device):
+            total, terms = training_loss(distance, albedo_hs, batch, self.loss_config, log_sigma)
         self.log("train/loss", total)
         self.log_dict({f"train/{name}": value for name, value in terms.items()})
-        return total
+        found = {"terms": {name: value.detach() for name, value in terms.items()}, "distance": distance.detach()}
+        return {"loss": total, **found}
 
     def validation_step(self, batch: FrameBatch, batch_idx: int) -> None:
         distance, albedo_hs = self(batch)
-        total, terms = self_supervised_loss(distance, albedo_hs, batch, self.loss_config)
+        with full_precision(self.device):
+            total, terms = self_supervised_loss(distance, albedo_hs, batch, self.loss_config)
+        terms["inconsistency"] = inconsistency(self, batch, distance)
         size = len(batch.image)
         self.log("val/loss", total, batch_size=size, sync_dist=True)
         self.log_dict({f"val/{name}": value for name, value in terms.items()}, batch_size=size, sync_dist=True)
@@ -80,18 +115,45 @@ class LightDepth(pl.LightningModule):
         ray_z = batch.rays[:, 2:3]
         truth = depth_from_distance(batch.true_distance, ray_z)
         valid = batch.true_valid & (ray_z > _MIN_RAY_Z)
-        closed_form = log_closed_form(batch.image, batch.mask, batch.rays, batch.light).exp()
+        with full_precision(self.device):
+            closed_form = log_closed_form(batch.image, batch.mask, batch.rays, batch.light).exp()
         self.errors.update(depth_from_distance(distance, ray_z), truth, valid)
         self.closed_form_errors.update(depth_from_distance(closed_form, ray_z), truth, valid)
 
     def on_validation_epoch_end(self) -> None:
         for prefix, metric in (("val/", self.errors), ("val/closed_form/", self.closed_form_errors)):
-            if metric.frames > 0:
-                self.log_dict({prefix + name: value.float() for name, value in metric.compute().items()})
+            # Every process computes, because that is where they meet; NaN where none of them saw any truth.
+            errors = metric.compute()
+            if not any(value.isnan() for value in errors.values()):
+                self.log_dict({prefix + name: value.float() for name, value in errors.items()})
             metric.reset()
 
     def configure_optimizers(self) -> Any:
-        optimizer = torch.optim.AdamW(self.parameters(), lr=self.learning_rate, weight_decay=self.weight_decay)
+        learning = [p for p in self.parameters() if p.requires_grad]
+        optimizer = torch.optim.AdamW(learning, lr=self.learning_rate, weight_decay=self.weight_decay)
+        if self.schedule == "constant":
+            return optimizer
         total = int(self.trainer.estimated_stepping_batches)
-        schedule = _OneCycle(optimizer, max_lr=self.learning_rate, total_steps=total)
+        schedule: LambdaLR | OneCycleLR
+        if self.schedule == "one_cycle":
+            schedule = _OneCycle(optimizer, max_lr=self.learning_rate, total_steps=total)
+        else:
+            schedule = LambdaLR(optimizer, lambda step: 0.5 + 0.5 * math.cos(math.pi * min(step / total, 1)))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _start_from(self, checkpoint: str) -> None:
+        from lightdepth.checkpoint import load_model
+        from lightdepth.predict import NetworkModel
+
+        model = load_model(checkpoint, details=False)
+        if not isinstance(model, NetworkModel):
+            raise InputError(f"{checkpoint}: has no weights to start from; expected a trained checkpoint")
+        ours, theirs = self.network.state_dict(), model.network.state_dict()
+        body = {name for name in ours if name.startswith("body.")}
+        fits = all(name in theirs and theirs[name].shape == ours[name].shape for name in body)
+        if not fits or model.network.config.inputs != self.network.config.inputs:
+            raise InputError(
+                f"{checkpoint}: is {model.network.config}, which does not fit {self.network.config}; "
+                "give the same kind, inputs, encoder and width"
+            )
+        self.network.load_state_dict({n: v.cpu() for n, v in theirs.items() if n in ours}, strict=False)

@@ -91,9 +91,9 @@ class NetworkModel:
     @torch.inference_mode()
     def __call__(self, frame: Frame) -> DepthPrediction:
         batch = to_batch(frame, working_size(frame.camera, self.rows)).to(self.device)
-        distance, albedo_hs = self.network(batch.image, batch.mask, batch.rays, batch.light)
+        distance, albedo_hs, log_sigma = self.network.estimate(batch.image, batch.mask, batch.rays, batch.light)
         albedo = hue_saturation_albedo(albedo_hs) if self.details else None
-        return _prediction(frame, batch, distance.log(), albedo, self.name, self.details)
+        return _prediction(frame, batch, distance.log(), albedo, self.name, self.details, log_sigma)
 
 
 def predict(
@@ -107,7 +107,13 @@ def predict(
 
 
 def _prediction(
-    frame: Frame, batch: FrameBatch, log_distance: Tensor, albedo: Tensor | None, source: str, details: bool
+    frame: Frame,
+    batch: FrameBatch,
+    log_distance: Tensor,
+    albedo: Tensor | None,
+    source: str,
+    details: bool,
+    log_sigma: Tensor | None = None,
 ) -> DepthPrediction:
     """Brings what was computed on a batch of one at the working size to the frame's."""
     size = (frame.camera.width, frame.camera.height)
@@ -123,6 +129,7 @@ def _prediction(
         source=source,
         albedo=None if albedo is None else _upsampled(_extended(albedo, batch.mask), size),
         normals=normals,
+        uncertainty=None if log_sigma is None else np.exp(_upsampled(_extended(log_sigma, batch.mask), size)),
     )
 
 

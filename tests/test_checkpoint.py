@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import save_file
+from scenes import cylinder
 
+from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, bundled, load_model, read_card, save_model
 from lightdepth.errors import InputError
 from lightdepth.module import LightDepth
@@ -68,7 +70,10 @@ def test_every_bundled_checkpoint_loads_and_has_a_card():
 
 def test_the_default_checkpoint_is_bundled():
     assert DEFAULT_CHECKPOINT in bundled()
-    assert load_model().name == DEFAULT_CHECKPOINT
+    model = load_model()
+    assert model.name == DEFAULT_CHECKPOINT
+    frame = cylinder(Pinhole(40, 32, 22.0, 22.0, 18.0, 17.0)).frame()
+    assert model(frame).uncertainty is None  # made before there was a head for it
 
 
 def test_an_unknown_name_is_refused_with_the_names_there_are():
@@ -111,7 +116,7 @@ def test_weights_without_a_card_or_of_another_network_are_refused(tmp_path):
     save_file({"w": torch.zeros(3)}, str(path), metadata=metadata)
     with pytest.raises(InputError, match="do not fit"):
         load_model(path)
-    save_file({"w": torch.zeros(3)}, str(path), metadata={**metadata, "network": '{"kind": "dpt"}'})
+    save_file({"w": torch.zeros(3)}, str(path), metadata={**metadata, "network": '{"kind": "vgg"}'})
     with pytest.raises(InputError, match="tiny, unet"):
         load_model(path)
 

@@ -4,23 +4,31 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.losses import (
     LossConfig,
+    albedo_loss,
     brightness_residual,
     chroma_loss,
     facing_loss,
+    log_error,
     masked_mean,
     masked_median,
     photometric_loss,
     render_image,
     rendered_log_brightness,
+    rendered_rgb,
+    rgb_residual,
     saturated_loss,
     self_supervised_loss,
     smoothness_loss,
+    specular_loss,
+    ssim_loss,
     supervised_loss,
     training_loss,
+    uncertainty_loss,
 )
 from lightdepth.photometry import LightTerms, PhotometricCalibration, encode, hue_saturation_albedo
 
@@ -239,3 +247,180 @@ def test_the_total_is_the_weighted_sum_of_its_terms():
     total, terms = self_supervised_loss(spoilt(batch.true_distance), colour, batch, config)
     weights = asdict(config)
     assert torch.isclose(total, sum(weights[name] * value for name, value in terms.items()))
+
+
+PAPER = replace(LAMBERT, space="encoded", gain="one", huber=0.0, chroma=0.0, saturated=0.0, facing=0.0, smoothness=0.0)
+
+
+@pytest.mark.parametrize("space", ["log", "encoded", "linear"])
+def test_in_every_space_truth_has_no_photometric_error_and_a_wrong_distance_has(space):
+    config = replace(PAPER, space=space)
+    batch, colour = tube_batch(gain=0.8, config=config)
+    at_gain = batch.true_distance * 0.8**-0.5  # with the gain fixed at 1, a dimmer light is a longer distance
+    right = self_supervised_loss(at_gain, colour, batch, config)[1]["photometric"]
+    wrong = self_supervised_loss(spoilt(at_gain), colour, batch, config)[1]["photometric"]
+    assert right < 2e-3 and wrong > 20 * right
+
+
+def test_with_the_gain_fixed_the_loss_gives_distance_its_scale():
+    batch, colour = tube_batch(config=PAPER)
+    right, shorter = (self_supervised_loss(batch.true_distance * f, colour, batch, PAPER)[0] for f in (1.0, 0.8))
+    assert right < 2e-3 < 0.02 < shorter
+
+
+def test_the_papers_photometric_term_teaches_the_albedo_too():
+    batch, colour = tube_batch(config=PAPER)
+    wrong = colour * 0.5
+    assert self_supervised_loss(batch.true_distance, wrong, batch, PAPER)[0] > 0.01
+    in_log = replace(PAPER, space="log")
+    assert self_supervised_loss(batch.true_distance, wrong, batch, in_log)[0] < 2e-3
+
+
+def test_linear_light_is_the_encoded_to_the_power_of_gamma():
+    image, rendered = torch.tensor([0.5, 0.2]).reshape(2, 1, 1, 1, 1)
+    gamma = torch.tensor(2.2)
+    assert torch.isclose(rgb_residual(image, rendered, gamma, "linear"), torch.tensor(0.5**2.2 - 0.2**2.2)).all()
+    assert torch.isclose(rgb_residual(image, rendered, gamma, "encoded"), torch.tensor(0.3)).all()
+
+
+def test_l1_is_huber_of_no_width():
+    residual = torch.tensor([0.01, -1.0]).reshape(1, 1, 1, 2)
+    assert torch.isclose(
+        photometric_loss(residual, torch.ones_like(residual, dtype=torch.bool), 0.0), torch.tensor(0.505)
+    )
+
+
+def test_ssim_agrees_with_its_formula_and_leaves_out_windows_with_an_unusable_pixel():
+    generator = torch.Generator().manual_seed(0)
+    image, other = torch.rand(2, 1, 3, 11, 11, generator=generator, dtype=torch.float64)
+    x = torch.arange(5, dtype=torch.float64) - 2
+    kernel = torch.exp(-(x**2) / (2 * 1.5**2))
+    kernel = (kernel[:, None] * kernel / kernel.sum() ** 2).reshape(1, 1, 5, 5).expand(3, 1, 5, 5)
+
+    def blurred(values):
+        return F.conv2d(values, kernel, groups=3)
+
+    a, b = blurred(image), blurred(other)
+    va, vb, ab = blurred(image**2) - a * a, blurred(other**2) - b * b, blurred(image * other) - a * b
+    slow = ((2 * a * b + 1e-4) * (2 * ab + 9e-4)) / ((a * a + b * b + 1e-4) * (va + vb + 9e-4))
+    usable = torch.ones(1, 1, 11, 11, dtype=torch.bool)
+    inner = torch.zeros_like(usable)
+    inner[..., 2:-2, 2:-2] = True
+    whole = ssim_loss(image, other, usable)
+    assert ssim_loss(image, image, usable) < 1e-9 < whole
+    usable[..., :, 0] = usable[..., :, -1] = usable[..., 0, :] = usable[..., -1, :] = False
+    spoilt_border = torch.where(usable, other, torch.full_like(other, torch.nan))
+    framed = ssim_loss(image, spoilt_border, usable)
+    expected = ((1 - slow) / 2)[..., 1:-1, 1:-1].mean()  # windows that touch no pixel of the border
+    assert torch.isclose(framed, expected, rtol=1e-4)
+
+
+def test_highlights_face_the_light():
+    rays = pinhole_rays(6, 8)
+    everywhere = torch.ones(1, 1, 6, 8, dtype=torch.bool)
+    assert specular_loss(-rays, rays, everywhere).abs() < 1e-6
+    tilted = F.normalize(-rays + 0.5 * torch.tensor([1.0, 0, 0]).reshape(1, 3, 1, 1), dim=1)
+    assert specular_loss(tilted, rays, everywhere) > 0.03
+    assert specular_loss(tilted, rays, ~everywhere) == 0
+
+
+def test_an_even_albedo_costs_nothing_and_a_speckled_one_does():
+    batch, colour = tube_batch()
+    speckled = colour.clone()
+    speckled[:, 1, ::2, ::2] = 0.9
+    assert albedo_loss(colour, batch.mask) == 0 < 0.01 < albedo_loss(speckled, batch.mask)
+
+
+def test_the_likelihood_of_an_error_is_greatest_at_its_own_size():
+    generator = torch.Generator().manual_seed(0)
+    error = torch.distributions.Laplace(0.0, 0.2).icdf(torch.rand(1, 1, 100, 100, generator=generator))
+    valid = torch.ones_like(error, dtype=torch.bool)
+
+    def loss(sigma: float) -> torch.Tensor:
+        return uncertainty_loss(torch.full_like(error, sigma).log(), error, valid)
+
+    right = 0.2 * 2**0.5
+    assert loss(right) < loss(right * 1.2) and loss(right) < loss(right / 1.2)
+
+
+def test_the_uncertainty_term_teaches_nothing_but_the_uncertainty():
+    batch, colour = tube_batch()
+    distance = spoilt(batch.true_distance).requires_grad_()
+    log_sigma = torch.full_like(distance, -2.0).detach().requires_grad_()
+    config = LossConfig(self_supervised=0.0, uncertainty=1.0)
+    total, terms = training_loss(distance, colour, batch, config, log_sigma)
+    total.backward()
+    assert "uncertainty" in terms and (distance.grad == 0).all() and (log_sigma.grad != 0).any()
+
+
+def test_the_log_error_has_no_scale_and_is_zero_where_there_is_no_truth():
+    batch, _ = tube_batch()
+    valid = batch.true_valid.clone()
+    valid[..., :5] = False
+    error = log_error(batch.true_distance * 3, batch.true_distance * valid, valid)
+    assert error.abs().max() < 1e-5
+    assert (log_error(spoilt(batch.true_distance), batch.true_distance, valid)[..., :5] == 0).all()
+
+
+@pytest.mark.parametrize("values", [{"space": "hsv"}, {"gain": "two"}, {"smoothness": -1.0}, {"huber": -0.1}])
+def test_a_loss_that_makes_no_sense_is_refused(values):
+    with pytest.raises(InputError, match="loss"):
+        LossConfig(**values)
+
+
+def gradcheck_inputs():
+    """A bumpy surface of 4x5 pixels in float64, away from every kink of the terms."""
+    generator = torch.Generator().manual_seed(3)
+    rays = pinhole_rays(4, 5).double()
+    log_distance = (torch.rand(1, 1, 4, 5, generator=generator, dtype=torch.float64) * 0.3).requires_grad_()
+    albedo = (torch.tensor([0.55, 0.4], dtype=torch.float64).reshape(1, 2, 1, 1) + torch.zeros(1, 2, 4, 5)).double()
+    albedo = (albedo + 0.05 * torch.rand(1, 2, 4, 5, generator=generator, dtype=torch.float64)).requires_grad_()
+    image = 0.2 + 0.6 * torch.rand(1, 3, 4, 5, generator=generator, dtype=torch.float64)
+    mask = torch.ones(1, 1, 4, 5, dtype=torch.bool)
+    mask[..., 0, 0] = False
+    light = LightTerms(*(t.double() for t in PhotometricCalibration().terms()))
+    truth = 1 + torch.rand(1, 1, 4, 5, generator=generator, dtype=torch.float64)
+    return log_distance, albedo, FrameBatch(image, mask, rays, light, truth, mask)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        replace(LAMBERT, smoothness=0.0, chroma=0.0),
+        replace(LAMBERT, photometric=0.0, facing=0.0, chroma=0.0),
+        replace(LAMBERT, photometric=0.0, smoothness=0.0, facing=0.0),
+        replace(PAPER, photometric=1.0, albedo=0.5),
+        replace(PAPER, photometric=1.0, space="linear", huber=0.05),
+        replace(PAPER, photometric=0.0, ssim=1.0),
+        replace(PAPER, photometric=0.0, facing=1.0, cosine_floor=0.9),
+        replace(PAPER, photometric=0.0, specular=1.0, white=0.5),
+        replace(PAPER, photometric=0.0, saturated=1.0, white=0.5),
+        replace(PAPER, photometric=0.0, supervised=1.0),
+    ],
+    ids=["log", "smoothness", "chroma", "paper", "linear", "ssim", "facing", "specular", "saturated", "supervised"],
+)
+def test_gradients_of_every_term_are_right(config):
+    log_distance, albedo, batch = gradcheck_inputs()
+    config = replace(config, gain="one")  # the median of the gain has no gradient by intent
+
+    def loss(log_distance, albedo):
+        return training_loss(log_distance.exp(), albedo, batch, config)[0]
+
+    assert torch.autograd.gradcheck(loss, (log_distance, albedo), eps=1e-6, atol=1e-5)
+    gradients = torch.autograd.grad(loss(log_distance, albedo), (log_distance, albedo), allow_unused=True)
+    assert any(g is not None and (g != 0).any() for g in gradients)
+
+
+def test_the_gradient_of_the_likelihood_is_right():
+    log_distance, _, batch = gradcheck_inputs()
+    error = log_error(log_distance.exp(), batch.true_distance, batch.true_valid).detach()
+    log_sigma = torch.full_like(error, -1.0).requires_grad_()
+    assert torch.autograd.gradcheck(lambda s: uncertainty_loss(s, error, batch.true_valid), (log_sigma,))
+
+
+def test_rendered_colour_is_brightness_times_the_encoded_albedo():
+    log_v = torch.tensor(0.5).log().reshape(1, 1, 1, 1)
+    albedo = torch.tensor([0.5, 0.6]).reshape(1, 2, 1, 1)  # red, saturation 0.6
+    red, green, blue = rendered_rgb(log_v, albedo, torch.tensor(2.0).reshape(1, 1, 1, 1)).flatten()
+    assert torch.isclose(red, torch.tensor(0.5)) and torch.isclose(green, torch.tensor(0.5 * 0.4**0.5))
+    assert torch.isclose(green, blue)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from colons import colon
 from lightning.pytorch import Callback, seed_everything
 from scenes import cylinder
 
@@ -14,16 +15,22 @@ import train.fit as fit_module
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import load_model, read_card
-from lightdepth.errors import InputError
-from lightdepth.frame import to_batch
+from lightdepth.datasets import write_c3vd, write_folder
+from lightdepth.datasets.endomapper import write_endomapper
+from lightdepth.decline import log_closed_form
+from lightdepth.errors import InputError, PartialFailure
+from lightdepth.frame import flipped, to_batch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.losses import LossConfig, self_supervised_loss
+from lightdepth.metrics import inconsistency
 from lightdepth.module import LightDepth
 from lightdepth.network import NetworkConfig
 from lightdepth.photometry import PhotometricCalibration, irradiance
+from lightdepth.predict import NetworkModel
+from lightdepth.tube import lens
 from train.callbacks import validation_line
 from train.cli import train
-from train.datamodule import FrameDataModule, TubeData, augmented, collate, flipped, read_frame_list
+from train.datamodule import FrameDataModule, TubeData, augmented, collate, read_frame_list
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs" / "train").glob("*.yaml"))
 LIGHT = PhotometricCalibration(gain=100.0, position_mm=(1.0, 2.0, 0.5), direction=(0.1, -0.05, 1.0))
@@ -72,6 +79,15 @@ def test_augmentation_follows_from_the_generator_and_keeps_images_in_range():
     first, second, third = (augmented(batch, torch.Generator().manual_seed(s)) for s in (1, 1, 2))
     assert torch.equal(first.image, second.image) and not torch.equal(first.image, third.image)
     assert first.image.min() >= 0 and first.image.max() <= 1
+
+
+def test_what_is_saturated_stays_saturated_however_dark_the_exposure():
+    batch = batch_of(8)
+    white = batch._replace(image=batch.image.clone())
+    white.image[..., :9, :9] = white.image[..., -9:, -9:] = 1.0
+    white.image[..., :9, -9:] = white.image[..., -9:, :9] = 1.0
+    drawn = augmented(white, torch.Generator().manual_seed(0)).image
+    assert (drawn[..., :9, :9] == 1).all() and (drawn < 0.97).any()
 
 
 def test_synthetic_colons_follow_from_the_seed_and_validation_colons_are_others():
@@ -222,22 +238,8 @@ def test_an_interrupted_run_resumed_ends_where_an_uninterrupted_one_does(finishe
     """Same order, augmentation and schedule: the checkpoint at step 10 of 20, continued, gives the same weights."""
     run = tmp_path / "interrupted"
     arguments = ["-o", str(run), *TINY_RUN, "--trainer.max_steps", "20"]
-
-    class Interrupted(RuntimeError):
-        pass
-
-    class Stop(Callback):
-        def on_train_batch_start(self, trainer, module, batch, batch_idx):
-            if trainer.global_step == 10:
-                raise Interrupted
-
-    original = fit_module._with_callbacks
-    fit_module._with_callbacks = lambda given, output, echo: original({**given, "callbacks": [Stop()]}, output, echo)
-    try:
-        with pytest.raises(Interrupted):
-            train(arguments)
-    finally:
-        fit_module._with_callbacks = original
+    with pytest.raises(Interrupted), Halt(at=10):
+        train(arguments)
     assert steps_in(run) == 10 and not (run / "run.json").exists()
     with pytest.raises(InputError, match="unfinished"):
         train(arguments)
@@ -245,7 +247,7 @@ def test_an_interrupted_run_resumed_ends_where_an_uninterrupted_one_does(finishe
     weights = [
         torch.load(r / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"] for r in (run, finished_run)
     ]
-    assert all(torch.allclose(weights[0][name], weights[1][name], atol=1e-5) for name in weights[0])
+    assert equal(*weights)
 
 
 def test_training_on_a_folder_without_truth_reports_the_loss_alone(tmp_path):
@@ -316,3 +318,277 @@ def test_every_light_keeps_its_numbers_through_collation():
     lights = [LIGHT, replace(LIGHT, mu=0.0)]
     batch = collate([to_batch(cylinder(CAMERA).frame(light=light)) for light in lights])
     assert batch.light.mu.flatten().tolist() == pytest.approx([LIGHT.mu, 0.0])
+
+
+def quick(tmp_path: Path, *options: str, name: str = "run", sequence: Path | None = None, steps: int = 12) -> Path:
+    """A run of a few steps on a dozen frames of a cylinder."""
+    folder = sequence or tmp_path / "seq"
+    if not folder.exists():
+        write_sequence(folder)
+    basic = ["--data.sequences", f"[{folder}]", "--data.size", "[40, 32]", "--model.network.width", "4"]
+    basic += ["--trainer.accelerator", "cpu", "--trainer.max_steps", str(steps), "--trainer.val_check_interval", "6"]
+    assert train(["-o", str(tmp_path / name), *basic, *options]) == 0
+    return tmp_path / name
+
+
+def state(run: Path, key: str = "state_dict") -> dict[str, torch.Tensor]:
+    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)[key]
+
+
+def equal(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
+    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_two_runs_of_one_seed_are_equal_to_the_bit_and_of_two_seeds_are_not(tmp_path):
+    first, second = (quick(tmp_path, name=name) for name in ("a", "b"))
+    assert equal(state(first), state(second))
+    assert not equal(state(first), state(quick(tmp_path, "--seed", "1", name="c")))
+
+
+@pytest.mark.parametrize("schedule", ["one_cycle", "cosine"])
+def test_averaged_weights_are_what_is_exported_and_a_resumed_average_is_the_uninterrupted_one(tmp_path, schedule):
+    options = ["--fit.ema", "0.8", "--model.schedule", schedule, "--fit.monitor", "last"]
+    whole = quick(tmp_path, *options, name="whole", steps=10)
+    averaged, current = state(whole), state(whole, "current_model_state")
+    assert steps_in(whole) == 10 and not equal(averaged, current)
+    exported = load_model(whole / "model.safetensors").network.state_dict()
+    for name, value in exported.items():
+        assert torch.equal(value, averaged[f"network.{name}"].half().float()), name
+
+    run = tmp_path / "halted"
+    with pytest.raises(Interrupted), Halt(at=6):
+        quick(tmp_path, *options, name="halted", steps=10)
+    assert steps_in(run) == 6
+    quick(tmp_path, *options, "--resume", name="halted", steps=10)
+    assert equal(state(run), averaged) and equal(state(run, "current_model_state"), current)
+
+
+class Interrupted(RuntimeError):
+    pass
+
+
+class Halt(Callback):
+    """Within `with`, runs end with Interrupted after step `at`."""
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+
+    def on_train_batch_start(self, trainer, module, batch, batch_idx):
+        if trainer.global_step == self.at:
+            raise Interrupted
+
+    def __enter__(self):
+        self.original = fit_module._with_callbacks
+        fit_module._with_callbacks = with_callback(self)
+
+    def __exit__(self, *raised):
+        fit_module._with_callbacks = self.original
+
+
+@pytest.mark.parametrize(("schedule", "last"), [("constant", 2e-3), ("cosine", 0.0)])
+def test_the_learning_rate_follows_its_schedule(tmp_path, schedule, last):
+    run = quick(tmp_path, "--model.schedule", schedule, steps=6)
+    saved = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    assert saved["optimizer_states"][0]["param_groups"][0]["lr"] == pytest.approx(last, abs=2e-4)
+    with pytest.raises(InputError, match="one_cycle"):
+        LightDepth(schedule="step")
+
+
+def test_half_precision_trains_without_a_single_bad_number_and_pure_half_precision_is_refused(tmp_path):
+    run = quick(tmp_path, "--trainer.precision", "bf16-mixed")
+    errors = json.loads((run / "run.json").read_text())["errors"]
+    assert all(np.isfinite(value) for value in errors.values())
+    assert all(torch.isfinite(value).all() for value in state(run).values())
+    whole = json.loads((quick(tmp_path, name="whole") / "run.json").read_text())["errors"]
+    assert errors["loss"] == pytest.approx(whole["loss"], rel=0.2)
+    with pytest.raises(InputError, match="bf16-mixed"):
+        quick(tmp_path, "--trainer.precision", "bf16-true", name="pure")
+
+
+def test_gradients_are_clipped_unless_told_otherwise(capsys):
+    with pytest.raises(SystemExit):
+        train(["--print_config"])
+    assert "gradient_clip_val: 1.0" in capsys.readouterr().out
+
+
+def test_a_run_that_no_longer_gets_better_ends_early(tmp_path):
+    options = ["--fit.patience", "1", "--model.learning_rate", "1e-9", "--trainer.val_check_interval", "2"]
+    run = quick(tmp_path, *options, steps=40)
+    assert steps_in(run) < 40
+    with pytest.raises(InputError, match="criterion"):
+        quick(tmp_path, "--fit.patience", "1", "--fit.monitor", "last", name="no")
+
+
+def test_speed_is_logged_in_frames(tmp_path):
+    run = quick(tmp_path)
+    assert "frames/s" in (run / "log.txt").read_text()
+
+
+def write_images(folder: Path, image: np.ndarray, count: int = 12) -> Path:
+    """A sequence whose frames are all this image (32, 40, 3)."""
+    write_sequence(folder, count)
+    for i in range(count):
+        cv2.imwrite(str(folder / "frames" / f"{i:04d}.png"), image)
+    return folder
+
+
+@pytest.mark.parametrize(("value", "said"), [(0, "100% black"), (255, "100% of the pixels are saturated")])
+def test_frames_without_a_usable_pixel_end_the_run_with_their_names(tmp_path, value, said):
+    sequence = write_images(tmp_path / "seq", np.full((32, 40, 3), value, np.uint8))
+    with pytest.raises(InputError) as stopped:
+        quick(tmp_path, "--fit.diagnosis.blind", "3", sequence=sequence)
+    assert said in str(stopped.value) and f"{sequence}: 00" in str(stopped.value)
+
+
+def test_one_black_frame_among_others_does_no_harm(tmp_path):
+    sequence = write_sequence(tmp_path / "seq")
+    cv2.imwrite(str(sequence / "frames" / "0003.png"), np.zeros((32, 40, 3), np.uint8))
+    cv2.imwrite(str(sequence / "frames" / "0004.png"), np.full((32, 40, 3), 255, np.uint8))
+    run = quick(tmp_path, sequence=sequence)
+    assert all(torch.isfinite(value).all() for value in state(run).values())
+
+
+class Poison(Callback):
+    """Makes the gradients of these steps NaN."""
+
+    def __init__(self, steps) -> None:
+        self.steps = steps
+
+    def on_after_backward(self, trainer, module):
+        if trainer.global_step in self.steps or trainer.fit_loop.total_batch_idx in self.steps:
+            next(p for p in module.parameters() if p.grad is not None).grad.fill_(torch.nan)
+
+
+def with_callback(callback):
+    original = fit_module._with_callbacks
+    return lambda given, *rest: original({**given, "callbacks": [callback]}, *rest)
+
+
+def test_a_step_with_a_bad_gradient_is_left_out_and_training_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(fit_module, "_with_callbacks", with_callback(Poison({3, 4})))
+    run = quick(tmp_path)
+    assert all(torch.isfinite(value).all() for value in state(run).values())
+
+
+def test_gradients_that_stay_bad_end_the_run_with_a_diagnosis_and_its_checkpoint(tmp_path, monkeypatch):
+    monkeypatch.setattr(fit_module, "_with_callbacks", with_callback(Poison(range(4, 1000))))
+    with pytest.raises(PartialFailure) as stopped:
+        quick(tmp_path, "--fit.diagnosis.patience", "3")
+    assert "gradient of network.body" in str(stopped.value) and "seq: 00" in str(stopped.value)
+    assert all(torch.isfinite(value).all() for value in state(tmp_path / "run").values())
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
+def test_a_distance_that_collapses_is_called_so(tmp_path):
+    with pytest.raises(PartialFailure, match=r"constant for 4 batches"):
+        options = ["--fit.diagnosis.constant", "4", "--model.network.output", "free", "--model.learning_rate", "0"]
+        quick(tmp_path, *options)
+
+
+def test_pixels_that_are_no_numbers_are_masked_out():
+    frame = cylinder(CAMERA).frame(light=LIGHT)
+    image = frame.image.copy()
+    image[3, 4] = np.nan
+    batch = to_batch(replace(frame, image=image))
+    assert torch.isfinite(batch.image).all() and not batch.mask[0, 0, 3, 4] and not batch.true_valid[0, 0, 3, 4]
+    assert batch.mask.sum() == to_batch(frame).mask.sum() - 1
+
+
+def test_an_albedo_cannot_eat_the_shading():
+    """With value 1 no albedo, however dark its other channels, stands in for the shading that distance explains."""
+    batch = batch_of(1)
+    config = LossConfig(reflectance=0.0, gain="one", space="encoded", chroma=0.0)
+    flat = torch.full_like(batch.true_distance, float(batch.true_distance.median())) / 10
+    dark, bright = (torch.full((1, 2, 32, 40), v) for v in (0.95, 0.05))
+    for albedo in (dark, bright):
+        shaded = self_supervised_loss(batch.true_distance / 10, albedo * 0, batch, config)[1]["photometric"]
+        assert self_supervised_loss(flat, albedo, batch, config)[1]["photometric"] > 2 * shaded
+
+
+def test_an_uncertainty_head_is_trained_calibrated_and_saved_and_the_distance_stays_as_it_started(tmp_path):
+    options = [*TINY_RUN, "--trainer.max_steps", "6", "--model.network.uncertainty", "true"]
+    options += ["--model.loss.uncertainty", "1", "--model.freeze_distance", "true"]
+    run = tmp_path / "run"
+    assert train(["-o", str(run), *options]) == 0
+    card = read_card(run / "model.safetensors")
+    assert card["uncertainty"]["frames"] == 4 and set(card["uncertainty"]["coverage"]) == {"50%", "68%", "90%", "95%"}
+    assert "uncertainty head alone" in card["trained_on"] and (run / "uncertainty.png").is_file()
+    assert "sparsification" in (run / "model.md").read_text()
+    seed_everything(0, verbose=False)
+    fresh = LightDepth(NetworkConfig(width=4, uncertainty=True), LossConfig(uncertainty=1.0)).network.state_dict()
+    model = load_model(run / "model.safetensors")
+    assert isinstance(model, NetworkModel)
+    learned = {n: v for n, v in model.network.state_dict().items()}
+    assert all(torch.equal(learned[n], fresh[n].half().float()) for n in fresh if n.startswith("body."))
+    assert any(
+        not torch.equal(learned[n], fresh[n].half().float()) for n in fresh if n.startswith("uncertainty.layers")
+    )
+    assert learned["uncertainty.calibration"].tolist() == pytest.approx(
+        [card["uncertainty"]["exponent"], np.log(card["uncertainty"]["scale"])], abs=2e-2
+    )
+    frame = cylinder(CAMERA).frame(light=LIGHT)
+    prediction = model(frame)
+    assert prediction.uncertainty.shape == prediction.distance.shape and (prediction.uncertainty > 0).all()
+    with pytest.raises(InputError, match=r"network\.uncertainty"):
+        LightDepth(NetworkConfig(), LossConfig(uncertainty=1.0))
+
+
+def test_a_run_starts_from_a_checkpoint_that_fits(tmp_path):
+    start = quick(tmp_path, name="first") / "model.safetensors"
+    module = LightDepth(NetworkConfig(width=4, uncertainty=True), start=str(start))
+    given = load_model(start).network.state_dict()
+    assert all(torch.equal(module.network.state_dict()[n], v) for n, v in given.items())
+    for config, checkpoint in ((NetworkConfig(width=8), str(start)), (NetworkConfig(), "decline")):
+        with pytest.raises(InputError, match=r"fit|no weights"):
+            LightDepth(config, start=checkpoint)
+
+
+def frames_for(path: Path, folder: Path) -> list[str]:
+    """What the configuration needs to be tried: colons it makes itself, or a small tree of its data set."""
+    if "tube:" in path.read_text():
+        return [f"--data.tube.{name}={count}" for name, count in (("scenes", 1), ("val_scenes", 1), ("frames", 4))]
+    lens_of = {"endomapper.yaml": "fisheye"}.get(path.name, "c3vd")
+    frames = colon(0, 6, 10.0, lens(lens_of, 100, 80)).frames
+    if path.name == "c3vd.yaml":
+        write_c3vd(frames, folder)
+    elif path.name == "endomapper.yaml":
+        write_endomapper([replace(frame, name=f"out{n}") for n, frame in enumerate(frames, 1)], folder)
+    else:
+        write_folder(frames, folder)
+    return ["--data.sequences", f"[{folder}]"]
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.name)
+def test_every_shipped_configuration_takes_two_steps_and_its_model_predicts(path, tmp_path):
+    small = ["--data.size", "[40, 32]", "--data.batch_size", "2", "--data.num_workers", "0"]
+    small += ["--trainer.max_steps", "2", "--trainer.accelerator", "cpu"]
+    run = tmp_path / "run"
+    assert train(["--config", str(path), "-o", str(run), *frames_for(path, tmp_path / "data"), *small]) == 0
+    prediction = load_model(run / "model.safetensors")(cylinder(CAMERA).frame(light=LIGHT))
+    assert np.isfinite(prediction.distance).all() and prediction.distance.std() >= 0
+
+
+def test_the_mirrored_and_darker_batch_changes_nothing_for_the_closed_form_and_something_for_a_guess():
+    batch = batch_of()
+
+    def closed_form(b):
+        return log_closed_form(b.image, b.mask, b.rays, b.light).exp(), None
+
+    def guess(b):
+        return closed_form(b)[0] * torch.exp(b.image[:, :1] - b.rays[:, :1] * torch.linspace(0, 1, 40)), None
+
+    assert inconsistency(closed_form, batch, closed_form(batch)[0]) < 1e-3
+    assert inconsistency(guess, batch, guess(batch)[0]) > 0.02
+
+
+@pytest.mark.slow
+def test_two_processes_train_together_although_only_one_of_them_sees_truth(tmp_path):
+    """The validation frames are one without truth and one with: one for each process."""
+    blind, seeing = write_sequence(tmp_path / "blind", 1), tmp_path / "seeing"
+    write_folder(colon(0, 1, 10.0, CAMERA).frames, seeing)
+    options = ["--data.val_sequences", f"[{blind}, {seeing}]", "--data.batch_size", "1", "--trainer.devices", "2"]
+    options += ["--trainer.strategy", "ddp_fork", "--fit.ema", "0.5", "--model.network.uncertainty", "true"]
+    run = quick(tmp_path, *options, "--model.loss.uncertainty", "1", sequence=write_sequence(tmp_path / "seq"))
+    record = json.loads((run / "run.json").read_text())
+    assert record["steps"] == 12 and "abs_rel_median" in record["errors"]
+    assert (run / "log.txt").read_text().count("step 12/12") == 1

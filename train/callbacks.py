@@ -1,10 +1,12 @@
-"""What a training run shows while it runs: pictures in TensorBoard, and progress that reads well in a log file too."""
+"""What a training run shows while it runs, and what stops it: pictures, progress, a diagnosis when it goes wrong."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import lightning.pytorch as pl
@@ -12,10 +14,13 @@ import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from lightdepth.decline import log_closed_form
+from lightdepth.decline import informative, log_closed_form
+from lightdepth.errors import InputError, PartialFailure
 from lightdepth.frame import FrameBatch
 from lightdepth.losses import masked_median, render_image
+from lightdepth.losses.masked import masked_std
 from lightdepth.module import LightDepth
+from lightdepth.photometry import brightness
 
 
 class Panels(pl.Callback):
@@ -53,7 +58,10 @@ class Panels(pl.Callback):
 
 
 class Progress(pl.Callback):
-    """One line every `every` steps, with speed and time left, and one per validation. `echo` takes each line."""
+    """One line every `every` steps, with speed and time left, and one per validation. `echo` takes each line.
+
+    The logger gets the speed as frames per second, over all processes.
+    """
 
     def __init__(self, echo: Callable[[str], None], every: int = 50) -> None:
         self.echo, self.every = echo, every
@@ -69,9 +77,11 @@ class Progress(pl.Callback):
         if step % self.every and step != total:
             return
         rate = (step - self._first) / max(time.monotonic() - self._start, 1e-9)
-        line = (
-            f"step {step}/{total:.0f}  loss {_number(trainer.callback_metrics.get('train/loss'))}  {rate:.1f} steps/s"
-        )
+        frames = rate * len(batch.image) * trainer.accumulate_grad_batches * trainer.world_size
+        if trainer.logger is not None:
+            trainer.logger.log_metrics({"train/frames_per_s": frames}, step=step)
+        loss = _number(trainer.callback_metrics.get("train/loss"))
+        line = f"step {step}/{total:.0f}  loss {loss}  {rate:.1f} steps/s, {frames:.0f} frames/s"
         if math.isfinite(total):
             line += f"  {_clock((total - step) / max(rate, 1e-9))} left"
         self.echo(line)
@@ -79,6 +89,110 @@ class Progress(pl.Callback):
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if trainer.training or trainer.state.fn == "fit":
             self.echo(f"step {trainer.global_step}  {validation_line(trainer.callback_metrics)}")
+
+
+@dataclass(frozen=True)
+class DiagnosisConfig:
+    """When a run that goes nowhere is stopped.
+
+    Args:
+        patience: batches in a row with a loss or gradient that is no number, which are skipped until then.
+        blind: batches in a row without a usable pixel (all black or saturated).
+        constant: batches in a row in which distance is as good as constant although brightness is not.
+    """
+
+    patience: int = 10
+    blind: int = 50
+    constant: int = 200
+
+
+class Diagnosis(pl.Callback):
+    """Skips a step whose gradient is no number, and stops the run, saying why, when it does not get better.
+
+    A distance counts as constant when its log varies by less than a hundredth of the closed form's. `names` gives the
+    frames of a batch, as far as they are known, from epoch and batch index.
+    """
+
+    def __init__(self, config: DiagnosisConfig, names: Callable[[int, int], list[str]]) -> None:
+        self.config, self.names = config, names
+        self.skipped = 0
+        self._row: Counter[str] = Counter()
+        self._bad = ""
+
+    def on_train_batch_start(
+        self, trainer: pl.Trainer, module: pl.LightningModule, batch: FrameBatch, batch_idx: int
+    ) -> None:
+        self._bad = ""
+
+    def on_before_optimizer_step(
+        self, trainer: pl.Trainer, module: pl.LightningModule, optimizer: torch.optim.Optimizer
+    ) -> None:
+        wrong = [n for n, p in module.named_parameters() if p.grad is not None and not torch.isfinite(p.grad).all()]
+        if not wrong:
+            return
+        self._bad = wrong[0]
+        if getattr(trainer.precision_plugin, "scaler", None) is None:  # a scaler skips such steps by itself
+            for parameter in module.parameters():
+                parameter.grad = None
+
+    @torch.no_grad()
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: FrameBatch, batch_idx: int
+    ) -> None:
+        wrong = bool(self._bad) or not bool(torch.isfinite(outputs["loss"]))
+        self.skipped += wrong
+        where = self._where(trainer, batch_idx)
+        if self._in_a_row("number", wrong) >= self.config.patience:
+            raise PartialFailure(
+                f"training: {self.config.patience} steps in a row without a finite gradient, the last {where}: "
+                f"{_not_finite(batch, outputs, module, self._bad)}. Lower model.learning_rate, train in precision "
+                "32-true, or leave those frames out; the checkpoints until here are kept"
+            )
+        usable = informative(batch.image, batch.mask)
+        assert isinstance(module, LightDepth), type(module)
+        white = usable & (brightness(batch.image) >= module.loss_config.white)
+        if self._in_a_row("blind", not (usable & ~white).any()) >= self.config.blind:
+            inside = batch.mask.sum().clamp(min=1)
+            raise InputError(
+                f"training: no usable pixel in {self.config.blind} batches in a row, the last {where}: "
+                f"{float(white.sum() / inside):.0%} of the pixels are saturated, "
+                f"{float((batch.mask & ~usable).sum() / inside):.0%} black, "
+                f"{float(1 - batch.mask.float().mean()):.0%} outside the mask; "
+                "expected images that show the decline of light: check exposure, mask and image folder"
+            )
+        closed = log_closed_form(batch.image, batch.mask, batch.rays, batch.light)
+        spread, expected = masked_std(outputs["distance"].log(), usable), masked_std(closed, usable)
+        flat = bool(((spread < 0.01 * expected) & (expected > 0.05)).all())
+        if self._in_a_row("constant", flat) >= self.config.constant:
+            raise PartialFailure(
+                f"training: distance has been constant for {self.config.constant} batches, the last {where}: its log "
+                f"varies by {float(spread.mean()):.2g}, the closed form's by {float(expected.mean()):.2g}. The network "
+                "has collapsed: lower model.loss.smoothness or model.learning_rate; the checkpoints until here are kept"
+            )
+
+    def _in_a_row(self, what: str, happened: bool) -> int:
+        self._row[what] = self._row[what] + 1 if happened else 0
+        return self._row[what]
+
+    def _where(self, trainer: pl.Trainer, batch_idx: int) -> str:
+        names = self.names(trainer.current_epoch, batch_idx) if trainer.world_size == 1 else []
+        shown = f" ({', '.join(names)})" if names else ""
+        return f"step {trainer.global_step}, batch {batch_idx} of epoch {trainer.current_epoch}{shown}"
+
+
+def _not_finite(batch: FrameBatch, outputs: Any, module: pl.LightningModule, gradient: str) -> str:
+    """The first thing that is not a number, in the order in which it would spread."""
+    if not torch.isfinite(batch.image).all():
+        return "the image has pixels that are not numbers"
+    broken = [name for name, value in module.named_parameters() if not torch.isfinite(value).all()]
+    if broken:
+        return f"weights {broken[0]} are not numbers"
+    if not torch.isfinite(outputs["distance"]).all():
+        return "the predicted distance is not a number"
+    terms = [name for name, value in outputs["terms"].items() if not torch.isfinite(value)]
+    if terms:
+        return f"loss term{'s' if len(terms) > 1 else ''} {', '.join(terms)} not a number"
+    return f"the gradient of {gradient} is not a number, though the loss is"
 
 
 def validation_line(metrics: Any) -> str:

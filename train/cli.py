@@ -29,7 +29,7 @@ def train(argv: list[str] | None = None) -> int:
     from lightdepth.module import LightDepth
 
     from .datamodule import FrameDataModule
-    from .fit import check_output, fit
+    from .fit import FitConfig, check_output, fit
 
     given = list(sys.argv[1:] if argv is None else argv)
     parser = ArgumentParser(
@@ -44,6 +44,7 @@ def train(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of weights, colons, order and augmentation")
     parser.add_class_arguments(LightDepth, "model")
     parser.add_class_arguments(FrameDataModule, "data")
+    parser.add_class_arguments(FitConfig, "fit")
     parser.add_class_arguments(pl.Trainer, "trainer", instantiate=False, skip={"default_root_dir"})
     parser.link_arguments("seed", "data.seed")
     parser.link_arguments("data.size", "model.rows", compute_fn=lambda size: size[1])
@@ -58,7 +59,7 @@ def train(argv: list[str] | None = None) -> int:
     pl.seed_everything(config.seed, workers=True, verbose=False)
     made = parser.instantiate(config)
     text = parser.dump(kept, skip_validation=True)
-    flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given}
+    flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given, "settings": made.fit}
     fit(made.model, made.data, output, vars(made.trainer), text, config.seed, **flags)
     return 0
 

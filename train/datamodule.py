@@ -7,7 +7,7 @@ resumed run sees what an uninterrupted one would have seen.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,14 +15,14 @@ from typing import Any, Literal
 import lightning.pytorch as pl
 import numpy as np
 import torch
-from torch import Tensor
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, Sampler
 
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.datasets.splits import Chosen, Split, check_apart, folders, read_split
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame, FrameBatch, to_batch
-from lightdepth.photometry import LightTerms, decode, encode
+from lightdepth.frame import Frame, FrameBatch, flipped, to_batch
+from lightdepth.losses import LossConfig
+from lightdepth.photometry import LightTerms, brightness, decode, encode
 from lightdepth.progress import Progress
 from lightdepth.tube.scene import TubeConfig
 
@@ -57,6 +57,7 @@ class TubeData:
 
 
 _NO_TUBE = TubeData()
+_WHITE = LossConfig().white
 _VAL_SEEDS = 1_000_000  # validation colons are drawn from here on, so that more scenes never run into them
 _SEEDS_APART = 10_000
 
@@ -122,10 +123,10 @@ class FrameDataModule(pl.LightningDataModule):
             held_out = 0 if to_validate else max(1, len(chosen) // 10)
             if len(chosen) <= held_out:
                 raise InputError(f"{path}: {len(chosen)} frame; expected at least two, one of them to validate on")
-            train.append(_Frames(chosen[: len(chosen) - held_out], self.size))
+            train.append(_Frames(chosen[: len(chosen) - held_out], self.size, path))
             if held_out:
-                val.append(_Frames(chosen[-held_out:], self.size))
-        val += [_Frames(_chosen(_open(path, of), None, path), self.size) for path, of in to_validate]
+                val.append(_Frames(chosen[-held_out:], self.size, path))
+        val += [_Frames(_chosen(_open(path, of), None, path), self.size, path) for path, of in to_validate]
         if self.tube.scenes + self.tube.val_scenes > 0:
             with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
                 first = self.seed * _SEEDS_APART
@@ -156,7 +157,9 @@ class FrameDataModule(pl.LightningDataModule):
     def _colons(self, first_seed: int, count: int, bar: Progress) -> list[Dataset]:
         made: list[Dataset] = []
         for i in range(count):
-            made.append(_Cached(tube_scene(self.tube, first_seed + i, i, self.size)))
+            seed = first_seed + i
+            frames = tube_scene(self.tube, seed, i, self.size)
+            made.append(_Cached(frames, [f"colon {seed} frame {k}" for k in range(len(frames))]))
             bar.advance()
         return made
 
@@ -165,6 +168,15 @@ class FrameDataModule(pl.LightningDataModule):
         """Number of frames to train and to validate on."""
         assert self._train is not None and self._val is not None, "setup() first"
         return {"train": len(self._train), "val": len(self._val)}
+
+    def names(self, epoch: int, batch: int) -> list[str]:
+        """Names of the training frames of a batch of an epoch, in a run of one process."""
+        assert self._train is not None, "setup() first"
+        order = _Shuffled(len(self._train), self.seed)
+        order.set_epoch(epoch)
+        everyone = [name for part in self._train.datasets for name in part.names]  # type: ignore[attr-defined]
+        first = batch * self.batch_size
+        return [everyone[i] for i in list(order)[first : first + self.batch_size]]
 
     def train_dataloader(self) -> DataLoader:
         assert self._train is not None
@@ -180,7 +192,9 @@ class FrameDataModule(pl.LightningDataModule):
         trainer = self.trainer
         if not self.augment or trainer is None or not trainer.training:
             return batch
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + trainer.global_step)
+        # Every process of a distributed run augments in its own way.
+        seed = self.seed * 1_000_003 + trainer.global_step + trainer.global_rank * 1_000_000_007
+        generator = torch.Generator().manual_seed(seed)
         return augmented(batch, generator)
 
     def _loader(self, dataset: Dataset, **options: Any) -> DataLoader:
@@ -202,48 +216,34 @@ def collate(batches: Sequence[FrameBatch]) -> FrameBatch:
     return FrameBatch(image, mask, rays, light, true_distance, true_valid)
 
 
-def flipped(batch: FrameBatch, chosen: Tensor, axis: int) -> FrameBatch:
-    """The chosen (B,) bool images in a mirror: axis 0 left for right, axis 1 top for bottom.
-
-    Everything is mirrored, rays and light with the image, so that what is seen stays physically right.
-    """
-    which = chosen.reshape(-1, 1, 1, 1)
-    sign = torch.ones(1, 3, 1, 1, device=batch.image.device)
-    sign[:, axis] = -1
-    sign = torch.where(which, sign, 1.0)
-
-    def mirror(tensor: Tensor) -> Tensor:
-        return torch.where(which, tensor.flip(-1 - axis), tensor)
-
-    light = batch.light._replace(position=batch.light.position * sign, direction=batch.light.direction * sign)
-    return FrameBatch(
-        image=mirror(batch.image),
-        mask=mirror(batch.mask),
-        rays=mirror(batch.rays) * sign,
-        light=light,
-        true_distance=mirror(batch.true_distance),
-        true_valid=mirror(batch.true_valid),
-    )
-
-
 def augmented(batch: FrameBatch, generator: torch.Generator) -> FrameBatch:
-    """Flips along both axes, each with probability 1/2, and linear exposure times exp(0.1 N), clipped at white."""
+    """Flips along both axes, each with probability 1/2, and linear exposure times exp(0.1 N), clipped at white.
+
+    What was saturated stays so: how bright it was, nobody knows, and darkened it would pass for a measurement.
+    """
     count, device = len(batch.image), batch.image.device
     for axis in (0, 1):
         batch = flipped(batch, (torch.rand(count, generator=generator) < 0.5).to(device), axis)
     exposure = torch.exp(0.1 * torch.randn(count, 1, 1, 1, generator=generator)).to(device)
     gamma = batch.light.gamma
-    return batch._replace(image=encode(exposure * decode(batch.image, gamma), gamma).clamp(max=1))
+    exposed = encode(exposure * decode(batch.image, gamma), gamma).clamp(max=1)
+    return batch._replace(image=torch.where(brightness(batch.image) >= _WHITE, batch.image, exposed))
 
 
 def tube_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> list[FrameBatch]:
     """The frames of one synthetic colon, as batches of one."""
-    from lightdepth.tube import lens, realistic, tube_frames
+    from lightdepth.tube import lens, tube_frames
 
-    camera = lens(tube.lenses[index % len(tube.lenses)], *size)
-    config = tube.scene or (realistic() if tube.family == "realistic" else TubeConfig())
-    config = replace(config, sensor=replace(config.sensor, mu=tube.mu, gamma=tube.gamma, reflectance=tube.reflectance))
+    camera, config = lens(tube.lenses[index % len(tube.lenses)], *size), tube_config(tube)
     return [to_batch(f, size) for f in tube_frames(seed, tube.frames, camera, travel=tube.travel, config=config)]
+
+
+def tube_config(tube: TubeData) -> TubeConfig:
+    """What the colons and their endoscopes are drawn from."""
+    from lightdepth.tube import realistic
+
+    config = tube.scene or (realistic() if tube.family == "realistic" else TubeConfig())
+    return replace(config, sensor=replace(config.sensor, mu=tube.mu, gamma=tube.gamma, reflectance=tube.reflectance))
 
 
 def read_frame_list(path: Path) -> list[str]:
@@ -281,27 +281,36 @@ def _open(path: str, of: Listed | None = None) -> FrameSequence:
     return frames.at(rows)
 
 
-def _chosen(frames: FrameSequence, wanted: list[str] | None, path: str) -> list[Callable[[], Frame]]:
+def _chosen(frames: FrameSequence, wanted: list[str] | None, path: str) -> list[_Reader]:
     """Readers of the frames whose name (or its last part) is on the list, or of all."""
-
-    def reader(index: int) -> Callable[[], Frame]:
-        return lambda: frames[index]
-
-    if wanted is None:
-        return [reader(i) for i in range(len(frames))]
     names = frames.names
+    if wanted is None:
+        return [_Reader(frames, i, name) for i, name in enumerate(names)]
     listed = {Path(name).stem for name in wanted}
-    found = [reader(i) for i, name in enumerate(names) if Path(name).stem in listed]
+    found = [_Reader(frames, i, name) for i, name in enumerate(names) if Path(name).stem in listed]
     if not found:
         raise InputError(f"{path}: none of the {len(wanted)} listed frames is in it; its first is {names[0]}")
     return found
 
 
+@dataclass(frozen=True)
+class _Reader:
+    """One frame of a sequence, not read yet. No closure: processes are handed it."""
+
+    frames: Sequence[Frame]
+    index: int
+    name: str
+
+    def __call__(self) -> Frame:
+        return self.frames[self.index]
+
+
 class _Frames(Dataset):
     """Frames read when asked for, at one size."""
 
-    def __init__(self, readers: list[Callable[[], Frame]], size: tuple[int, int]) -> None:
+    def __init__(self, readers: list[_Reader], size: tuple[int, int], path: str) -> None:
         self.readers, self.size = readers, size
+        self.names = [f"{path}: {reader.name}" for reader in readers]
 
     def __len__(self) -> int:
         return len(self.readers)
@@ -311,8 +320,8 @@ class _Frames(Dataset):
 
 
 class _Cached(Dataset):
-    def __init__(self, batches: list[FrameBatch]) -> None:
-        self.batches = batches
+    def __init__(self, batches: list[FrameBatch], names: list[str]) -> None:
+        self.batches, self.names = batches, names
 
     def __len__(self) -> int:
         return len(self.batches)

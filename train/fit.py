@@ -1,9 +1,10 @@
 """The training run: a model, its data and a folder in; checkpoints, an exported model and a record of the run out.
 
 OUT/  config.yaml  log.txt  tensorboard/  checkpoints/{last,best}.ckpt  model.safetensors  model.md  run.json
+      uncertainty.png (where the network has that head, and validation frames have truth)
 
-`best` is the lowest validation loss without truth. run.json is written last, by rename: its presence means the run is
-complete.
+`best` is the lowest validation criterion, which needs no truth. run.json is written last, by rename: its presence means
+the run is complete.
 """
 
 from __future__ import annotations
@@ -16,24 +17,65 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning.pytorch as pl
 import torch
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.callbacks import (
+    EarlyStopping,
+    EMAWeightAveraging,
+    LearningRateMonitor,
+    ModelCheckpoint,
+    RichProgressBar,
+)
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 
 from lightdepth.checkpoint import load_model, save_model
 from lightdepth.errors import InputError
 from lightdepth.module import LightDepth
+from lightdepth.network import DepthNetwork
+from lightdepth.predict import NetworkModel
 from lightdepth.run import input_hash, versions, write_run_json
+from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
-from .callbacks import Panels, Progress, validation_line
+from .callbacks import Diagnosis, DiagnosisConfig, Panels, Progress, validation_line
 from .datamodule import FrameDataModule
 
-_OURS = ("config.yaml", "log.txt", "tensorboard", "checkpoints", "model.safetensors", "model.md", "run.json")
+_OURS = (
+    *("config.yaml", "log.txt", "tensorboard", "checkpoints", "model.safetensors", "model.md", "uncertainty.png"),
+    "run.json",
+)
+_PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mixed")
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How a run is watched, averaged and stopped.
+
+    Args:
+        ema: decay of the running average of the weights, which is then what is validated and exported; 0 for none.
+        monitor: what `best` and early stopping go by, on the validation frames; it needs no truth: the whole loss,
+            its photometric term, or how much distance changes in a mirror and in less light; "last" chooses nothing.
+        patience: validations without improvement after which the run ends; 0 for never.
+        diagnosis: when a run that goes nowhere is stopped.
+    """
+
+    ema: float = 0.0
+    monitor: Literal["loss", "photometric", "inconsistency", "last"] = "loss"
+    patience: int = 0
+    diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.ema < 1 or self.patience < 0:
+            raise InputError(f"fit: ema {self.ema}, patience {self.patience}; expected 0 <= ema < 1 and patience >= 0")
+        if self.patience and self.monitor == "last":
+            raise InputError("fit: patience without a criterion; set fit.monitor to loss, photometric or inconsistency")
+
+
+_FIT = FitConfig()
 
 
 def check_output(output: Path, resume: bool, overwrite: bool) -> None:
@@ -58,6 +100,7 @@ def fit(
     resume: bool = False,
     overwrite: bool = False,
     arguments: list[str] | None = None,
+    settings: FitConfig = _FIT,
 ) -> dict[str, float]:
     """Trains, exports, records; returns the errors of the exported model on the validation frames.
 
@@ -65,6 +108,11 @@ def fit(
     run goes on from checkpoints/last.ckpt, if there is one. Raises InputError, and leaves the folder as it is, when it
     holds a run and neither `resume` nor `overwrite` is given, or when data or checkpoint cannot be read.
     """
+    if trainer_options.get("precision") not in _PRECISIONS:
+        raise InputError(
+            f"trainer.precision {trainer_options['precision']}: the physics of light needs float32; "
+            "expected 32-true, 16-mixed or bf16-mixed"
+        )
     check_output(output, resume, overwrite)
     started = time.time()
     _quiet()
@@ -74,48 +122,86 @@ def fit(
     if resumed is not None:
         load_model(resumed)  # says what is wrong with it before anything is touched
     data.setup()
-    output.mkdir(parents=True, exist_ok=True)
-    for name in _OURS if overwrite else ("run.json",):
-        _remove(output / name)
-    (output / "config.yaml").write_text(config_yaml)
-    echo = _echo(output / "log.txt")
+    echo = _Echo(output / "log.txt")
+    if _first_process():
+        output.mkdir(parents=True, exist_ok=True)
+        for name in _OURS if overwrite else ("run.json",):
+            _remove(output / name)
+        (output / "config.yaml").write_text(config_yaml)
     echo(
         f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
     )
-    options = _with_callbacks(trainer_options, output, echo)
-    trainer = pl.Trainer(**options)
+    trainer = pl.Trainer(**_with_callbacks(trainer_options, output, echo, data, settings))
     if resume:
         echo(f"resuming from {last.name}" if resumed else "nothing to resume: starting anew")
     trainer.fit(model, datamodule=data, ckpt_path=resumed, weights_only=True)
     train_loss = trainer.callback_metrics.get("train/loss")
-    trainer.save_checkpoint(last)
 
     best = checkpoints / "best.ckpt"
     chosen = best if best.exists() else last
     found = trainer.validate(model, datamodule=data, ckpt_path=chosen, verbose=False, weights_only=True)[0]
     errors = {key.removeprefix("val/"): float(value) for key, value in found.items()}
     if trainer.is_global_zero:
-        card = _card(model, data, trainer, seed, chosen.stem, errors)
-        save_model(model.network, output / "model.safetensors", card)
+        final = f"train loss {float(train_loss):.4g}  " if train_loss is not None else ""
+        echo(f"final: {final}{validation_line(found)}")
+        exported = load_model(chosen)  # not `model`: where weights are averaged, the file has the average
+        assert isinstance(exported, NetworkModel)
+        doubt = _calibrate(exported.network, data, output) if model.loss_config.uncertainty > 0 else None
+        # Not the trainer's step: of processes started for the fit alone, it never hears.
+        steps = int(torch.load(last, map_location="cpu", weights_only=True)["global_step"])
+        card = _card(model, data, steps, seed, chosen.stem, errors, settings, doubt)
+        save_model(exported.network, output / "model.safetensors", card)
         (output / "model.md").write_text(card_text(card, output.name))
-        echo(
-            f"final: train loss {float(train_loss):.4g}  {validation_line(found)}"
-            if train_loss is not None
-            else f"final: {validation_line(found)}"
-        )
         echo(f"exported the {chosen.stem} checkpoint to {output / 'model.safetensors'}")
         record = {
             "seed": seed,
             "inputs": {path: input_hash(Path(path)) for path in [*data.sequences, *data.val_sequences]},
             "split": data.split,
             "frames": data.counts,
-            "steps": trainer.global_step,
+            "steps": steps,
             "resumed": resumed is not None,
             "units": {"rmse_mm": "mm", "medae_mm": "mm", "distance": "up to scale"},
             "errors": errors,
         }
         write_run_json(output, "train", {"argv": arguments or []}, started, record)
     return errors
+
+
+@torch.no_grad()
+def doubted_frames(network: DepthNetwork, data: FrameDataModule) -> list[Doubted]:
+    """Errors and uncertainties on the validation frames that have truth."""
+    frames, device = [], next(network.parameters()).device
+    for batch in data.val_dataloader():
+        batch = batch.to(device)
+        distance, _, log_sigma = network.estimate(batch.image, batch.mask, batch.rays, batch.light)
+        assert log_sigma is not None
+        columns = (distance, log_sigma.exp(), batch.true_distance, batch.true_valid)
+        for row in zip(*(column[:, 0].cpu().numpy() for column in columns), strict=True):
+            frame = doubted(*row)
+            if frame is not None:
+                frames.append(frame)
+    return frames
+
+
+def _calibrate(network: DepthNetwork, data: FrameDataModule, output: Path) -> dict[str, Any] | None:
+    """Calibrates the uncertainty head on the validation frames that have truth, and says how good it is on them."""
+    assert network.uncertainty is not None
+    frames = doubted_frames(network, data)
+    if not frames:
+        return None
+    fitted = fit_calibration(frames)
+    _set_calibration(network, fitted)
+    frames = [Doubted(frame.error, fitted(frame.sigma)) for frame in frames]
+    (output / "uncertainty.png").write_bytes(chart_png(frames))
+    return {"exponent": round(fitted.exponent, 4), "scale": round(fitted.scale, 4), **summary(frames)}
+
+
+def _set_calibration(network: DepthNetwork, fitted: Calibration) -> None:
+    """Puts a calibration on top of the one the network has."""
+    assert network.uncertainty is not None
+    old = network.uncertainty.calibration
+    new = torch.tensor([0.0, math.log(fitted.scale)]).to(old) + fitted.exponent * old
+    network.uncertainty.calibration.copy_(new)
 
 
 def _remove(path: Path) -> None:
@@ -139,10 +225,31 @@ def card_text(card: dict[str, Any], name: str) -> str:
             lines.append(f"| {who} | " + " | ".join(f"{value:.3f}" for value in values) + " |")
     else:
         lines.append(f"Validation loss (no truth): {errors.get('loss', math.nan):.4f}")
+    doubt = card.get("uncertainty")
+    if doubt:
+        mean, rms = (doubt["sparsification"][name] for name in ("mean", "rms"))
+        shares = ", ".join(f"{level}: {share:.1%}" for level, share in doubt["coverage"].items())
+        lines += [
+            "",
+            f"Uncertainty, calibrated on those frames: sparsification error {mean:.2f} (mean error), {rms:.2f} (RMS) "
+            f"of a random order's; share of pixels inside the intervals of {shares}.",
+        ]
     return "\n".join(lines) + "\n"
 
 
-def _with_callbacks(given: dict[str, Any], output: Path, echo: Callable[[str], None]) -> dict[str, Any]:
+class _SaveLast(pl.Callback):
+    """The last checkpoint of a run that ends well, before averaging puts the average in the place of the weights."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        trainer.save_checkpoint(self.path)
+
+
+def _with_callbacks(
+    given: dict[str, Any], output: Path, echo: Callable[[str], None], data: FrameDataModule, settings: FitConfig
+) -> dict[str, Any]:
     """Trainer options completed by the run's logger, checkpoints and progress."""
     options = dict(given)
     interval, steps = options.get("val_check_interval"), options.get("max_steps") or -1
@@ -151,8 +258,14 @@ def _with_callbacks(given: dict[str, Any], output: Path, echo: Callable[[str], N
     if options.get("logger") in (None, True):
         options["logger"] = TensorBoardLogger(str(output), name="tensorboard", version="")
     folder = str(output / "checkpoints")
+    monitor = f"val/{settings.monitor}"
+    best = (
+        []
+        if settings.monitor == "last"
+        else [ModelCheckpoint(folder, "best", monitor=monitor, enable_version_counter=False)]
+    )
     extra: list[pl.Callback] = [
-        ModelCheckpoint(folder, "best", monitor="val/loss", enable_version_counter=False),
+        *best,
         ModelCheckpoint(
             folder,
             "last",
@@ -161,8 +274,14 @@ def _with_callbacks(given: dict[str, Any], output: Path, echo: Callable[[str], N
             enable_version_counter=False,
         ),
         Panels(),
+        Diagnosis(settings.diagnosis, data.names),
         Progress(echo, every=_report_every(steps)),
+        _SaveLast(output / "checkpoints" / "last.ckpt"),
     ]
+    if settings.ema > 0:
+        extra.append(EMAWeightAveraging(decay=settings.ema))
+    if settings.patience > 0:
+        extra.append(EarlyStopping(monitor, patience=settings.patience))
     if options["logger"] is not False:
         extra.append(LearningRateMonitor("step"))
     if options.get("enable_progress_bar") is None:
@@ -180,21 +299,32 @@ def _report_every(steps: int) -> int:
 
 
 def _card(
-    model: LightDepth, data: FrameDataModule, trainer: pl.Trainer, seed: int, checkpoint: str, errors: dict[str, float]
+    model: LightDepth,
+    data: FrameDataModule,
+    steps: int,
+    seed: int,
+    checkpoint: str,
+    errors: dict[str, float],
+    settings: FitConfig,
+    doubt: dict[str, Any] | None,
 ) -> dict[str, Any]:
     tube = data.tube
     parts = [f"{len(data.sequences)} sequences{_of_split(data.split)}"] if data.sequences else []
     if tube.scenes:
         parts.append(f"{tube.scenes} synthetic colons of {tube.frames} frames each")
     truth = "with true distance in the loss" if model.loss_config.supervised > 0 else "no truth in the loss"
+    if model.loss_config.uncertainty > 0:
+        truth += " of distance; the uncertainty head alone learned from true distance"
     return {
         "trained_on": f"{' and '.join(parts)}, {data.size[0]}x{data.size[1]} pixels; {truth}.",
         "rows": model.rows,
-        "steps": trainer.global_step,
+        "steps": steps,
         "seed": seed,
         "checkpoint": checkpoint,
         "network": model.network.config.to_dict(),
         "loss": asdict(model.loss_config),
+        "fit": asdict(settings),
+        "uncertainty": doubt,
         "tube": asdict(tube) if tube.scenes or tube.val_scenes else None,
         "errors": errors,
         "version": versions().get("lightdepth", "not installed"),
@@ -211,13 +341,23 @@ def _of_split(split: str | None) -> str:
     )
 
 
-def _echo(log: Path) -> Callable[[str], None]:
-    def echo(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-        with log.open("a") as file:
-            file.write(line + "\n")
+def _first_process() -> bool:
+    """Known before there is a Trainer: the launcher's environment says it."""
+    return getattr(rank_zero_only, "rank", 0) == 0
 
-    return echo
+
+class _Echo:
+    """Lines for the terminal and the run's log, from the first process only. A class: processes are handed it."""
+
+    def __init__(self, log: Path) -> None:
+        self.log = log
+
+    def __call__(self, line: str) -> None:
+        if not _first_process():
+            return
+        print(line, file=sys.stderr, flush=True)
+        with self.log.open("a") as file:
+            file.write(line + "\n")
 
 
 def _quiet() -> None:

@@ -7,16 +7,21 @@ In: channels chosen by name, each zero outside the mask. Out, from three raw cha
 
     log t = mean c + a - mean a    output "absolute"
     log t = c + a - mean a         output "residual": a correction of the closed form; a = 0 is the baseline
+    log t = a                      output "free": a scale of its own, for losses with a fixed gain
     albedo = (sigmoid h, sigmoid s), hue and saturation of a colour whose value is 1
 
-The scale is always the closed form's: no loss that is free of gain could teach it, and left free it drifts until
-exp overflows.
+Unless it is "free" the scale is the closed form's: no loss that is free of gain could teach it, and it would drift
+until exp overflows.
+
+Uncertainty: the standard deviation of log t, once each frame's scale is taken out, from a head of its own (raw b):
+
+    log sigma = k b + log s        k, s the calibration, (1, 1) until lightdepth.uncertainty has fitted it
 """
 
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lightdepth.decline import log_closed_form
 from lightdepth.photometry import LightTerms
@@ -24,9 +29,10 @@ from lightdepth.photometry import LightTerms
 CHANNELS = {"rgb": 3, "closed_form": 1, "ray_z": 1, "mask": 1}
 """Inputs to choose from, and how many channels each takes."""
 
-OUTPUTS = ("residual", "absolute")
+OUTPUTS = ("residual", "absolute", "free")
 
 _LOG_LIMIT = 15.0  # only to keep exp, and its square, finite
+_LOG_SIGMA_LIMIT = 6.0
 
 
 def input_channels(names: tuple[str, ...]) -> int:
@@ -61,6 +67,36 @@ def network_inputs(
 def network_outputs(raw: Tensor, log_closed: Tensor, mask: Tensor, output: str) -> tuple[Tensor, Tensor]:
     """Distance (B, 1, H, W) > 0 and albedo as hue and saturation (B, 2, H, W), from raw channels (B, 3, H, W)."""
     shape = raw[:, :1].float()
+    if output == "free":
+        return shape.clamp(-_LOG_LIMIT, _LOG_LIMIT).exp(), raw[:, 1:].float().sigmoid()
     base = log_closed if output == "residual" else masked_mean(log_closed, mask)
     log_distance = base + shape - masked_mean(shape, mask)
     return log_distance.clamp(-_LOG_LIMIT, _LOG_LIMIT).exp(), raw[:, 1:].float().sigmoid()
+
+
+class UncertaintyHead(nn.Module):
+    """(B, channels, h, w) -> log sigma (B, 1, h, w). It reads features and never changes them.
+
+    `calibration` (2,) is (k, log s); it travels with the weights.
+    """
+
+    calibration: Tensor
+
+    def __init__(self, channels: int, width: int = 32) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(channels, width, 3, 1, 1),
+            nn.ReLU(),
+            nn.Conv2d(width, width, 3, 1, 2, dilation=2),
+            nn.ReLU(),
+            nn.Conv2d(width, 1, 1),
+        )
+        last = self.layers[-1]
+        assert isinstance(last, nn.Conv2d) and last.bias is not None
+        nn.init.normal_(last.weight, std=1e-3)
+        nn.init.constant_(last.bias, -2.0)  # 13 %, about what the closed form errs by
+        self.register_buffer("calibration", torch.tensor([1.0, 0.0]))
+
+    def forward(self, features: Tensor) -> Tensor:
+        raw = self.layers(features.detach()).float().clamp(-_LOG_SIGMA_LIMIT, _LOG_SIGMA_LIMIT)
+        return self.calibration[0] * raw + self.calibration[1]

@@ -1,20 +1,33 @@
-"""DepthNetwork: a calibrated image in, distance and albedo out."""
+"""DepthNetwork: a calibrated image in, distance, albedo and uncertainty out."""
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lightdepth.errors import InputError
-from lightdepth.network.heads import CHANNELS, OUTPUTS, input_channels, network_inputs, network_outputs
+from lightdepth.network import dpt, unet
+from lightdepth.network.dpt import DPT
+from lightdepth.network.heads import (
+    CHANNELS,
+    OUTPUTS,
+    UncertaintyHead,
+    input_channels,
+    network_inputs,
+    network_outputs,
+)
 from lightdepth.network.tiny import TinyUNet
 from lightdepth.network.unet import ResNetUNet
 from lightdepth.photometry import LightTerms
 
-KINDS = ("tiny", "unet")
+KINDS = ("tiny", "unet", "dpt")
+ENCODERS = {"tiny": (), "unet": tuple(unet.ENCODERS), "dpt": tuple(dpt.ENCODERS)}
+_DEFAULT_ENCODER = {"unet": "resnet18", "dpt": "vits14"}
 
 
 @dataclass(frozen=True)
@@ -22,17 +35,23 @@ class NetworkConfig:
     """Which network. Plain values, so that it travels as JSON inside a checkpoint.
 
     Args:
-        kind: "tiny" (0.5 M parameters) or "unet" (ResNet-18, 14 M).
+        kind: "tiny" (0.5 M parameters), "unet" (ResNet encoder) or "dpt" (vision transformer, extra `dpt`).
         inputs: channels that go in, of rgb, closed_form, ray_z, mask.
-        output: "residual" (a correction of the closed form) or "absolute" (log distance itself); both have its scale.
+        output: "residual" (a correction of the closed form) or "absolute" (log distance itself), both with its scale;
+            or "free" (log distance with a scale of its own, for losses with a fixed gain).
+        encoder: of unet resnet18 (14 M), resnet34, resnet50; of dpt vits14 (25 M), vitb14, vitl14, vitt14; null takes
+            the first.
+        uncertainty: a head of its own for the standard deviation of log distance.
         width: channels of the tiny network's first level.
         norm: normalisation of the tiny network, "batch" or "group".
         blur: width of the blur of the closed form that goes in, as a share of the image height.
     """
 
-    kind: Literal["tiny", "unet"] = "tiny"
+    kind: Literal["tiny", "unet", "dpt"] = "tiny"
     inputs: tuple[str, ...] = ("rgb", "closed_form", "ray_z")
-    output: Literal["residual", "absolute"] = "residual"
+    output: Literal["residual", "absolute", "free"] = "residual"
+    encoder: str | None = None
+    uncertainty: bool = False
     width: int = 16
     norm: Literal["batch", "group"] = "group"
     blur: float = 0.018
@@ -42,13 +61,19 @@ class NetworkConfig:
         unknown = [name for name in self.inputs if name not in CHANNELS]
         if unknown or not self.inputs:
             raise InputError(f"network inputs {list(self.inputs)}; expected some of {', '.join(CHANNELS)}")
-        for what, value, allowed in (
+        choices: tuple[tuple[str, str, tuple[str, ...]], ...] = (
             ("kind", self.kind, KINDS),
             ("output", self.output, OUTPUTS),
             ("norm", self.norm, ("batch", "group")),
-        ):
+        )
+        for what, value, allowed in choices:
             if value not in allowed:
                 raise InputError(f"network {what} {value!r}; expected one of {', '.join(allowed)}")
+        if self.encoder is None:
+            object.__setattr__(self, "encoder", _DEFAULT_ENCODER.get(self.kind))
+        elif self.encoder not in ENCODERS[self.kind]:
+            known = ", ".join(ENCODERS[self.kind]) or "none"
+            raise InputError(f"network encoder {self.encoder!r} of {self.kind}; expected {known}")
         if self.width < 1 or self.blur < 0:
             raise InputError(f"network width {self.width}, blur {self.blur}; expected width > 0 and blur >= 0")
 
@@ -65,6 +90,18 @@ class NetworkConfig:
             raise InputError(f"network configuration {values}: {error}") from error
 
 
+class Estimate(NamedTuple):
+    """What a network says about a batch.
+
+    distance (B, 1, H, W) > 0, up to scale; albedo_hs (B, 2, H, W) hue and saturation in [0, 1]; log_sigma (B, 1, H, W)
+    the log of the standard deviation of log distance, or None.
+    """
+
+    distance: Tensor
+    albedo_hs: Tensor
+    log_sigma: Tensor | None
+
+
 class DepthNetwork(nn.Module):
     """Any of the networks between the same inputs and outputs. Any image size: padded inside, cropped back."""
 
@@ -72,29 +109,54 @@ class DepthNetwork(nn.Module):
         super().__init__()
         self.config = config
         inputs, outputs = input_channels(config.inputs), 3
-        self.body: TinyUNet | ResNetUNet
+        self.body: TinyUNet | ResNetUNet | DPT
         if config.kind == "tiny":
             self.body = TinyUNet(inputs, outputs, config.width, config.norm)
+        elif config.kind == "unet":
+            self.body = ResNetUNet(inputs, outputs, config.encoder or "")
         else:
-            self.body = ResNetUNet(inputs, outputs)
-        # Training starts from the closed form (residual) or a flat distance (absolute), and a grey albedo.
+            self.body = DPT(inputs, outputs, config.encoder or "")
+        # Training starts from the closed form (residual) or a flat distance, and a grey albedo.
         nn.init.normal_(self.body.head.weight, std=1e-3)
         assert self.body.head.bias is not None
         nn.init.zeros_(self.body.head.bias)
+        self.uncertainty = UncertaintyHead(self.body.channels + inputs + 1) if config.uncertainty else None
 
     def forward(self, image: Tensor, mask: Tensor, rays: Tensor, light: LightTerms) -> tuple[Tensor, Tensor]:
-        """Distance (B, 1, H, W) > 0, up to scale, and albedo as hue and saturation (B, 2, H, W) in [0, 1].
+        """Distance and albedo of `estimate`."""
+        return self.estimate(image, mask, rays, light)[:2]
 
-        image (B, 3, H, W) encoded RGB; mask (B, 1, H, W) bool; rays (B, 3, H, W) unit; light terms (B, 1, 1, 1).
-        """
+    def estimate(self, image: Tensor, mask: Tensor, rays: Tensor, light: LightTerms) -> Estimate:
+        """image (B, 3, H, W) encoded RGB; mask (B, 1, H, W) bool; rays (B, 3, H, W) unit; light terms (B, 1, 1, 1)."""
         height, width = image.shape[-2:]
-        features, log_closed = network_inputs(image, mask, rays, light, self.config.inputs, self.config.blur)
+        with full_precision(image.device):
+            inputs, log_closed = network_inputs(image, mask, rays, light, self.config.inputs, self.config.blur)
         multiple = self.body.multiple
-        padding = (0, -width % multiple, 0, -height % multiple)
-        raw = self.body(F.pad(features, padding, mode="replicate"))[..., :height, :width]
-        return network_outputs(raw, log_closed, mask, self.config.output)
+        padded = F.pad(inputs, (0, -width % multiple, 0, -height % multiple), mode="replicate")
+        features = self.body(padded)
+        coarse = self.body.head(features)
+        raw = _resized(coarse, padded)[..., :height, :width]
+        with full_precision(image.device):
+            distance, albedo_hs = network_outputs(raw, log_closed, mask, self.config.output)
+        log_sigma = None
+        if self.uncertainty is not None:
+            seen = torch.cat([_resized(x, features) for x in (features, padded, coarse[:, :1])], 1)
+            log_sigma = _resized(self.uncertainty(seen), padded)[..., :height, :width]
+        return Estimate(distance, albedo_hs, log_sigma)
+
+
+def full_precision(device: torch.device) -> AbstractContextManager[Any]:
+    """Switches autocast off for a while: the physics of light spans more than half precision holds."""
+    kind = device.type
+    return torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext()
 
 
 def build_network(config: NetworkConfig) -> DepthNetwork:
     """A network with fresh weights, drawn from torch's global generator."""
     return DepthNetwork(config)
+
+
+def _resized(values: Tensor, like: Tensor) -> Tensor:
+    """Bilinear, to the height and width of `like`."""
+    size = like.shape[-2:]
+    return values if values.shape[-2:] == size else F.interpolate(values, size=size, mode="bilinear")

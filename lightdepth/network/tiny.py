@@ -48,7 +48,7 @@ class _Join(nn.Module):
 
 
 class TinyUNet(nn.Module):
-    """(B, inputs, H, W) -> (B, outputs, H, W), H and W multiples of `multiple`. Works at half resolution inside."""
+    """(B, inputs, H, W) -> features (B, channels, H/2, W/2) for `head`, H and W multiples of `multiple`."""
 
     multiple = 32
 
@@ -62,14 +62,14 @@ class TinyUNet(nn.Module):
             [_Residual(widths[0], widths[0], norm)] + [_Residual(a, b, norm, stride=2) for a, b in pairwise(widths)]
         )
         self.decoder = nn.ModuleList([_Join(b, a, a, norm) for a, b in zip(widths[-2::-1], widths[:0:-1], strict=True)])
-        self.head = nn.Conv2d(widths[0], outputs, 3, 1, 1)
+        self.channels = widths[0]
+        self.head = nn.Conv2d(self.channels, outputs, 3, 1, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        size = x.shape[-2:]
         skips = [self.stem(x)]
         for block in self.encoder:
             skips.append(block(skips[-1]))
         x = skips[-1]
         for join, skip in zip(self.decoder, skips[-2:0:-1], strict=True):
             x = join(x, skip)
-        return F.interpolate(self.head(x), size=size, mode="bilinear", align_corners=False)
+        return x

@@ -1,7 +1,7 @@
-"""A ResNet-18 encoder and a decoder with skip connections, in plain torch.
+"""ResNet encoders and a decoder with skip connections, in plain torch.
 
-The layout is the customary one of self-supervised depth networks (He et al., CVPR 2016; Godard et al., ICCV 2019): 11 M
-parameters down to 1/32 of the resolution, 3 M back up.
+The layout is the customary one of self-supervised depth networks (He et al., CVPR 2016; Godard et al., ICCV 2019).
+Parameters of the encoder are named as torchvision names them, so that its ImageNet weights can be read from a file.
 """
 
 from __future__ import annotations
@@ -10,52 +10,81 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-ENCODER = (64, 64, 128, 256, 512)
 DECODER = (16, 32, 64, 128, 256)
+
+ENCODERS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3), "resnet50": (3, 4, 6, 3)}
+"""Blocks per stage; resnet50's have a bottleneck."""
+
+STEM = "conv1.weight"
+"""The weights that see the image."""
 
 
 def _conv(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
 
 
-class _BasicBlock(nn.Module):
-    """ResNet's block of two 3x3 convolutions."""
+def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Module:
+    if inputs == outputs and stride == 1:
+        return nn.Identity()
+    return nn.Sequential(_conv(inputs, outputs, 1, stride), nn.BatchNorm2d(outputs))
 
-    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+
+class _BasicBlock(nn.Module):
+    """Two 3x3 convolutions."""
+
+    expansion = 1
+
+    def __init__(self, inputs: int, width: int, stride: int) -> None:
         super().__init__()
-        self.body = nn.Sequential(
-            _conv(inputs, outputs, 3, stride),
-            nn.BatchNorm2d(outputs),
-            nn.ReLU(),
-            _conv(outputs, outputs),
-            nn.BatchNorm2d(outputs),
-        )
-        same = inputs == outputs and stride == 1
-        self.shortcut: nn.Module = (
-            nn.Identity() if same else nn.Sequential(_conv(inputs, outputs, 1, stride), nn.BatchNorm2d(outputs))
-        )
+        self.conv1, self.bn1 = _conv(inputs, width, 3, stride), nn.BatchNorm2d(width)
+        self.conv2, self.bn2 = _conv(width, width), nn.BatchNorm2d(width)
+        self.downsample = _shortcut(inputs, width, stride)
 
     def forward(self, x: Tensor) -> Tensor:
-        return F.relu(self.body(x) + self.shortcut(x))
+        y = F.relu(self.bn1(self.conv1(x)))
+        return F.relu(self.bn2(self.conv2(y)) + self.downsample(x))
 
 
-class ResNet18(nn.Module):
-    """Features at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution, with 64, 64, 128, 256 and 512 channels."""
+class _Bottleneck(nn.Module):
+    """1x1, 3x3 and 1x1 convolutions; the middle one takes the stride."""
 
-    def __init__(self, inputs: int) -> None:
+    expansion = 4
+
+    def __init__(self, inputs: int, width: int, stride: int) -> None:
         super().__init__()
-        self.stem = nn.Sequential(_conv(inputs, ENCODER[0], 7, 2), nn.BatchNorm2d(ENCODER[0]), nn.ReLU())
+        outputs = width * self.expansion
+        self.conv1, self.bn1 = _conv(inputs, width, 1), nn.BatchNorm2d(width)
+        self.conv2, self.bn2 = _conv(width, width, 3, stride), nn.BatchNorm2d(width)
+        self.conv3, self.bn3 = _conv(width, outputs, 1), nn.BatchNorm2d(outputs)
+        self.downsample = _shortcut(inputs, outputs, stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = F.relu(self.bn1(self.conv1(x)))
+        y = F.relu(self.bn2(self.conv2(y)))
+        return F.relu(self.bn3(self.conv3(y)) + self.downsample(x))
+
+
+class ResNet(nn.Module):
+    """Features at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution, with `channels` channels."""
+
+    def __init__(self, encoder: str, inputs: int) -> None:
+        super().__init__()
+        block = _Bottleneck if encoder == "resnet50" else _BasicBlock
+        widths = (64, 128, 256, 512)
+        self.channels = (64, *(width * block.expansion for width in widths))
+        self.conv1, self.bn1 = _conv(inputs, 64, 7, 2), nn.BatchNorm2d(64)
         self.pool = nn.MaxPool2d(3, 2, 1)
-        pairs = zip(ENCODER[:-1], ENCODER[1:], (1, 2, 2, 2), strict=True)
-        self.stages = nn.ModuleList(
-            nn.Sequential(_BasicBlock(a, b, stride), _BasicBlock(b, b, 1)) for a, b, stride in pairs
-        )
+        for stage, (width, below, blocks) in enumerate(zip(widths, self.channels, ENCODERS[encoder], strict=False), 1):
+            stride = 1 if stage == 1 else 2
+            first = block(below, width, stride)
+            rest = [block(width * block.expansion, width, 1) for _ in range(blocks - 1)]
+            self.add_module(f"layer{stage}", nn.Sequential(first, *rest))
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        features = [self.stem(x)]
+        features = [F.relu(self.bn1(self.conv1(x)))]
         x = self.pool(features[0])
-        for stage in self.stages:
-            x = stage(x)
+        for stage in range(1, 5):
+            x = self.get_submodule(f"layer{stage}")(x)
             features.append(x)
         return features
 
@@ -72,18 +101,22 @@ class _UpConv(nn.Module):
 
 
 class ResNetUNet(nn.Module):
-    """(B, inputs, H, W) -> (B, outputs, H, W), H and W multiples of `multiple`. 14 M parameters."""
+    """(B, inputs, H, W) -> features (B, channels, H, W) for `head`, H and W multiples of `multiple`.
+
+    14 M parameters with resnet18, 24 M with resnet34, 33 M with resnet50.
+    """
 
     multiple = 32
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, encoder: str = "resnet18") -> None:
         super().__init__()
-        self.encoder = ResNet18(inputs)
-        below = [*DECODER[1:], ENCODER[-1]]
-        skips = [0, *ENCODER[:-1]]
+        self.encoder = ResNet(encoder, inputs)
+        below = [*DECODER[1:], self.encoder.channels[-1]]
+        skips = [0, *self.encoder.channels[:-1]]
         self.reduce = nn.ModuleList(_UpConv(b, d) for b, d in zip(below, DECODER, strict=True))
         self.join = nn.ModuleList(_UpConv(d + s, d) for d, s in zip(DECODER, skips, strict=True))
-        self.head = nn.Conv2d(DECODER[0], outputs, 3, 1, 1, padding_mode="replicate")
+        self.channels = DECODER[0]
+        self.head = nn.Conv2d(self.channels, outputs, 3, 1, 1, padding_mode="replicate")
 
     def forward(self, x: Tensor) -> Tensor:
         features = self.encoder(x)
@@ -93,4 +126,4 @@ class ResNetUNet(nn.Module):
             if level > 0:
                 x = torch.cat([x, features[level - 1]], 1)
             x = self.join[level](x)
-        return self.head(x)
+        return x

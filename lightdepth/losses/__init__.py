@@ -1,0 +1,48 @@
+"""What a depth network is trained on: one function per term, and their weighted sums.
+
+Everything is (B, C, H, W); a term is the mean over its pixels of each image, then over the images. Where a term has no
+pixel to speak of (black, saturated or fully masked images) it is 0 and has no gradient.
+
+The light is taken as co-located with the camera: its offset is a length, and t has only a scale.
+"""
+
+from lightdepth.losses.config import LossConfig
+from lightdepth.losses.light import (
+    brightness_residual,
+    chroma_loss,
+    photometric_loss,
+    rendered_log_brightness,
+    rendered_rgb,
+    rgb_residual,
+    saturated_loss,
+    specular_loss,
+    ssim_loss,
+)
+from lightdepth.losses.masked import masked_mean, masked_median
+from lightdepth.losses.surface import albedo_loss, facing_loss, smoothness_loss
+from lightdepth.losses.total import render_image, self_supervised_loss, training_loss
+from lightdepth.losses.truth import log_error, supervised_loss, uncertainty_loss
+
+__all__ = [
+    "LossConfig",
+    "albedo_loss",
+    "brightness_residual",
+    "chroma_loss",
+    "facing_loss",
+    "log_error",
+    "masked_mean",
+    "masked_median",
+    "photometric_loss",
+    "render_image",
+    "rendered_log_brightness",
+    "rendered_rgb",
+    "rgb_residual",
+    "saturated_loss",
+    "self_supervised_loss",
+    "smoothness_loss",
+    "specular_loss",
+    "ssim_loss",
+    "supervised_loss",
+    "training_loss",
+    "uncertainty_loss",
+]

@@ -1,0 +1,88 @@
+"""Terms that compare the light an image shows with the light that distance and albedo would give.
+
+Notation: t distance along the unit ray r, n normal, cos = -n · r; V = max(R, G, B), fall = exp(-mu (1 - cos psi)), E
+indirect light (lightdepth.radiosity), gamma the response, rho albedo of value 1, g gain. Rendered:
+
+    log V' = log(fall · max(cos, floor)^q / t² + E) / gamma,        I' = V' · rho^(1/gamma)
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from kornia.metrics import ssim
+from torch import Tensor
+
+from lightdepth.losses.config import LossConfig
+from lightdepth.losses.masked import masked_mean, masked_median
+from lightdepth.photometry import LightTerms, brightness, decode, encode, hue_saturation_albedo, irradiance
+from lightdepth.radiosity import indirect_irradiance
+
+_CHROMA_V = 0.1
+"""Below this brightness, colour is noise."""
+
+_SSIM_WINDOW = 5
+
+
+def rendered_log_brightness(
+    distance: Tensor, normals: Tensor, rays: Tensor, mask: Tensor, light: LightTerms, config: LossConfig
+) -> Tensor:
+    """log(fall · max(cos, floor)^q / t² + E) / gamma, the log brightness of a wall of value 1. (B, 1, H, W)"""
+    light = light.co_located()
+    direct = irradiance(distance, normals, rays, light, config.cosine_exponent, config.cosine_floor)
+    if config.reflectance is not None:
+        light = light._replace(reflectance=torch.full_like(light.reflectance, config.reflectance))
+    indirect: Tensor | float = 0.0
+    if bool((light.reflectance > 0).any()):
+        indirect = indirect_irradiance(distance.detach(), rays, mask, light, config.bounces, config.pool)
+    return (direct + indirect).clamp(min=1e-12).log() / light.gamma
+
+
+def brightness_residual(log_seen: Tensor, log_rendered: Tensor, usable: Tensor) -> Tensor:
+    """log V - log V' minus its median over the usable pixels: free of gain and exposure. (B, 1, H, W)"""
+    residual = log_seen - log_rendered
+    return residual - masked_median(residual, usable).detach()
+
+
+def rendered_rgb(log_rendered: Tensor, albedo_hs: Tensor, gamma: Tensor) -> Tensor:
+    """I' = V' rho^(1/gamma), encoded and not clipped. (B, 3, H, W)"""
+    return log_rendered.exp() * encode(hue_saturation_albedo(albedo_hs), gamma)
+
+
+def rgb_residual(image: Tensor, rendered: Tensor, gamma: Tensor, space: str) -> Tensor:
+    """I - I' as encoded, or I^gamma - I'^gamma in "linear" space. (B, 3, H, W)"""
+    return decode(image, gamma) - decode(rendered, gamma) if space == "linear" else image - rendered
+
+
+def photometric_loss(residual: Tensor, usable: Tensor, huber: float) -> Tensor:
+    """Huber(residual) / huber over the usable pixels: valid, not black, not saturated. L1 with huber 0."""
+    return masked_mean(F.smooth_l1_loss(residual, torch.zeros_like(residual), reduction="none", beta=huber), usable)
+
+
+def ssim_loss(image: Tensor, rendered: Tensor, usable: Tensor) -> Tensor:
+    """(1 - SSIM(I, I')) / 2 over windows of 5x5 usable pixels (Wang et al. 2004), RGB as encoded."""
+    shown = torch.where(usable, rendered.clamp(0, 1), image)
+    whole = -F.max_pool2d(-usable.to(image.dtype), _SSIM_WINDOW, 1, _SSIM_WINDOW // 2) > 0.5
+    return masked_mean((1 - ssim(image, shown, _SSIM_WINDOW)) / 2, whole)
+
+
+def saturated_loss(residual: Tensor, saturated: Tensor, usable: Tensor, huber: float) -> Tensor:
+    """Huber(max(residual, 0)) / huber on saturated pixels: the rendered may be brighter than white, not darker.
+
+    An image with no usable pixel has no gain to compare with, and counts 0.
+    """
+    darker = residual.clamp(min=0)
+    known = saturated & usable.flatten(1).any(1).reshape(-1, 1, 1, 1)
+    return masked_mean(F.smooth_l1_loss(darker, torch.zeros_like(darker), reduction="none", beta=huber), known)
+
+
+def specular_loss(normals: Tensor, rays: Tensor, highlights: Tensor) -> Tensor:
+    """1 - cos on highlights: light and eye coincide, so that a mirror shows the light where it faces it."""
+    return masked_mean(1 + (normals * rays).sum(1, keepdim=True), highlights)
+
+
+def chroma_loss(albedo_hs: Tensor, image: Tensor, light: LightTerms, mask: Tensor) -> Tensor:
+    """|(I / V)^gamma - rho|: with value 1 the albedo's colour is the image's, whatever the distance."""
+    v = brightness(image)
+    seen = decode((image / v.clamp(min=_CHROMA_V)).clamp(max=1), light.gamma)
+    return masked_mean((seen - hue_saturation_albedo(albedo_hs)).abs(), mask & (v > _CHROMA_V))

@@ -1,0 +1,80 @@
+"""The weighted sums."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from lightdepth.decline import informative
+from lightdepth.frame import FrameBatch
+from lightdepth.geometry import normals_from_distance
+from lightdepth.losses import light as lit
+from lightdepth.losses import surface, truth
+from lightdepth.losses.config import LossConfig
+from lightdepth.losses.masked import masked_median
+from lightdepth.photometry import brightness
+
+_V_FLOOR = 1e-2
+
+
+def self_supervised_loss(
+    distance: Tensor, albedo_hs: Tensor, batch: FrameBatch, config: LossConfig
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The weighted sum of all terms that need no truth, and the terms unweighted; those without weight are left out,
+    but for the five of the default."""
+    image, mask, rays, light = batch.image, batch.mask, batch.rays, batch.light
+    v = brightness(image)
+    log_seen = v.clamp(min=_V_FLOOR).log()
+    saturated = mask & (v >= config.white)
+    usable = informative(image, mask) & ~saturated
+
+    normals = normals_from_distance(distance, rays)
+    log_rendered = lit.rendered_log_brightness(distance, normals, rays, mask, light, config)
+    free = config.gain == "free"
+    residual = lit.brightness_residual(log_seen, log_rendered, usable) if free else log_seen - log_rendered
+    compared, rendered = residual, image
+    if config.space != "log" or config.ssim > 0:
+        rendered = lit.rendered_rgb(log_seen - residual, albedo_hs, light.gamma)
+    if config.space != "log":
+        compared = lit.rgb_residual(image, rendered, light.gamma, config.space)
+    terms = {
+        "photometric": lit.photometric_loss(compared, usable, config.huber),
+        "saturated": lit.saturated_loss(residual, saturated, usable, config.huber),
+        "facing": surface.facing_loss(normals, rays, mask, config.cosine_floor),
+        "smoothness": surface.smoothness_loss(distance.log(), log_seen, mask),
+        "chroma": lit.chroma_loss(albedo_hs, image, light, mask & ~saturated),
+    }
+    if config.ssim > 0:
+        terms["ssim"] = lit.ssim_loss(image, rendered, usable)
+    if config.specular > 0:
+        terms["specular"] = lit.specular_loss(normals, rays, saturated)
+    if config.albedo > 0:
+        terms["albedo"] = surface.albedo_loss(albedo_hs, mask)
+    total = sum((getattr(config, name) * value for name, value in terms.items()), start=distance.new_zeros(()))
+    return total, terms
+
+
+def training_loss(
+    distance: Tensor, albedo_hs: Tensor, batch: FrameBatch, config: LossConfig, log_sigma: Tensor | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """`self_supervised_loss`, and the terms with truth where the configuration gives them a weight."""
+    total, terms = self_supervised_loss(distance, albedo_hs, batch, config)
+    total = config.self_supervised * total
+    if config.supervised > 0:
+        found = truth.supervised_loss(distance, batch.true_distance, batch.true_valid)
+        terms = {**terms, **found}
+        total = total + config.supervised * sum(found.values(), start=distance.new_zeros(()))
+    if config.uncertainty > 0 and log_sigma is not None:
+        error = truth.log_error(distance, batch.true_distance, batch.true_valid)
+        terms["uncertainty"] = truth.uncertainty_loss(log_sigma, error, batch.true_valid)
+        total = total + config.uncertainty * terms["uncertainty"]
+    return total, terms
+
+
+def render_image(distance: Tensor, albedo_hs: Tensor, batch: FrameBatch, config: LossConfig) -> Tensor:
+    """The image as the loss renders it, its gain matched to the one seen and clipped at white. (B, 3, H, W)"""
+    normals = normals_from_distance(distance, batch.rays)
+    log_rendered = lit.rendered_log_brightness(distance, normals, batch.rays, batch.mask, batch.light, config)
+    v = brightness(batch.image)
+    usable = informative(batch.image, batch.mask) & (v < config.white)
+    gain = masked_median(v.clamp(min=_V_FLOOR).log() - log_rendered, usable)
+    return lit.rendered_rgb(log_rendered + gain, albedo_hs, batch.light.gamma).clamp(max=1) * batch.mask

@@ -1,0 +1,123 @@
+"""Encoder weights that others trained, from a local file. Nothing is downloaded and nothing is unpickled.
+
+unet: a state dict with torchvision's names (resnet18/34/50, ImageNet). dpt: a state dict with the names of Depth
+Anything or of DINOv2 in `transformers`, old or new. The first layer of such an encoder sees normalised RGB,
+(I - mean) / std; ours sees I - 1/2 and more channels: its colour weights are divided by std, the others start at 0.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from lightdepth.errors import InputError
+from lightdepth.network import dpt, unet
+from lightdepth.network.heads import CHANNELS
+from lightdepth.network.model import DepthNetwork
+from lightdepth.network.unet import ResNetUNet
+
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+_RENAMED = {  # transformers 4 -> 5
+    "attention.attention.query": "attention.q_proj",
+    "attention.attention.key": "attention.k_proj",
+    "attention.attention.value": "attention.v_proj",
+    "attention.output.dense": "attention.o_proj",
+}
+_IGNORED = ("fc.", "head.conv3.", "backbone.embeddings.mask_token", "num_batches_tracked")
+_SHOWN = 6
+
+
+def load_pretrained(network: DepthNetwork, path: Path | str) -> None:
+    """Puts the weights of a .safetensors or .pth file into the network's encoder (dpt: neck and head too, if there).
+
+    Raises InputError when the file cannot be read, or lists what does not fit.
+    """
+    path, kind = Path(path), network.config.kind
+    if kind == "tiny":
+        raise InputError(f"{path}: the tiny network takes no pretrained encoder; expected network kind unet or dpt")
+    if "rgb" not in network.config.inputs:
+        raise InputError(f"{path}: pretrained weights see colours; expected rgb among the network's inputs")
+    target: nn.Module = network.body
+    stem = dpt.STEM
+    optional: tuple[str, ...] = ()
+    given = {name: value for name, value in read_weights(path).items() if not _ignored(name)}
+    if isinstance(network.body, ResNetUNet):
+        target, stem = network.body.encoder, unet.STEM
+    else:
+        given = _as_depth_anything(given)
+        optional = ("head.",) if any(name.startswith("neck.") for name in given) else ("head.", "neck.", "conv")
+    wanted = {n: v for n, v in target.state_dict().items() if not _ignored(n)}
+    if stem in given and stem in wanted and given[stem].ndim == 4:
+        given[stem] = _first_layer(given[stem], wanted[stem], network.config.inputs)
+    problems = [f"missing {n}" for n in wanted.keys() - given.keys() if not n.startswith(optional or ("\0",))]
+    problems += [f"unknown {n}" for n in given.keys() - wanted.keys()]
+    problems += [
+        f"{n} is {tuple(given[n].shape)}, expected {tuple(wanted[n].shape)}"
+        for n in given.keys() & wanted.keys()
+        if given[n].shape != wanted[n].shape
+    ]
+    problems += [f"{n} is not finite" for n, v in given.items() if not torch.isfinite(v).all()]
+    if problems:
+        problems.sort()
+        shown = "; ".join(problems[:_SHOWN])
+        more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+        raise InputError(f"{path}: does not fit {kind} with {network.config.encoder}: {shown}{more}")
+    target.load_state_dict(given, strict=False)
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """A state dict from .safetensors, or from .pth / .pt without executing anything, in float32. Raises InputError."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected weights as .safetensors or .pth")
+    state: Any
+    try:
+        if path.suffix == ".safetensors":
+            state = load_file(str(path))
+        elif path.suffix in (".pth", ".pt"):
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        else:
+            raise InputError(f"{path}: unknown kind of weights; expected a name that ends in .safetensors or .pth")
+    except InputError:
+        raise
+    except (SafetensorError, Exception) as error:  # a damaged or hostile pickle can raise anything
+        first = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise InputError(f"{path}: damaged, or holds more than weights ({first})") from error
+    if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
+        state = state["state_dict"]
+    if not isinstance(state, dict) or not state or not all(isinstance(v, Tensor) for v in state.values()):
+        raise InputError(f"{path}: not a state dict; expected names and tensors")
+    return {name: value.float() if value.is_floating_point() else value for name, value in state.items()}
+
+
+def _ignored(name: str) -> bool:
+    return name.startswith(_IGNORED) or name.endswith(_IGNORED)
+
+
+def _as_depth_anything(given: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Names of a Depth Anything state dict, or of a bare DINOv2, as `DPT` has them."""
+    renamed = {}
+    bare = not any(name.startswith("backbone.") for name in given)
+    for name, value in given.items():
+        name = name.removeprefix("dinov2.")
+        if bare:
+            name = f"backbone.{name}"
+        if _ignored(name):
+            continue
+        for old, new in _RENAMED.items():
+            name = name.replace(old, new)
+        renamed[name.replace("head.conv", "conv")] = value
+    return renamed
+
+
+def _first_layer(given: Tensor, wanted: Tensor, inputs: tuple[str, ...]) -> Tensor:
+    """Weights (out, 3, h, w) for normalised RGB as weights for our inputs."""
+    weight = torch.zeros(given.shape[0], wanted.shape[1], *given.shape[2:])
+    start = sum(CHANNELS[name] for name in inputs[: inputs.index("rgb")])
+    weight[:, start : start + 3] = given[:, :3] / torch.tensor(IMAGENET_STD).reshape(1, 3, 1, 1)
+    return weight
