@@ -23,12 +23,15 @@ ORDER = (
     "import",
     "calibrate-light",
     "convert-camera",
+    "select",
     "train",
     "predict",
     "sparse",
     "densify",
     "evaluate",
 )
+FILES = ("calibrate-light", "convert-camera", "select")
+"""Verbs that write a file; the others make a folder."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -85,11 +88,13 @@ def _parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
             type=Path | None,
             required=needed,
             default=None if needed else default,
-            help="file to write" if verb in ("calibrate-light", "convert-camera") else "folder to make",
+            help="file to write" if verb in FILES else "folder to make",
         )
     if "overwrite" in parameters:
         parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run made there")
-    declared: set[str | int] = {name for name in ("output", "overwrite") if name in parameters}
+    if "no_frames" in parameters:
+        parser.add_argument("--no_frames", action="store_true", help="leave the pictures out")
+    declared: set[str | int] = {name for name in ("output", "overwrite", "no_frames") if name in parameters}
     parser.add_function_arguments(function, as_positional=True, sub_configs=True, skip=declared)
     flags = {name for name, parameter in parameters.items() if parameter.annotation in (bool, "bool")} - declared
     values = parser.instantiate(parser.parse_args(_spelled_out([_underscored(a) for a in argv], flags)))

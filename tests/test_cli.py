@@ -56,6 +56,7 @@ def test_help_lists_the_verbs_in_the_order_of_the_work_each_with_its_line(capsys
         "import",
         "calibrate-light",
         "convert-camera",
+        "select",
         "train",
         "predict",
         "sparse",

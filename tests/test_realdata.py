@@ -22,6 +22,8 @@ from lightdepth.frame import Frame
 from lightdepth.maps import read_map
 from lightdepth.predict import ConstantModel, DeclineModel
 from lightdepth.sparse_map import SparseMap
+from train.covisibility import SIFT_NODES, MapRules, select_by_map, select_by_matching
+from train.matching import OrientationDescriptor, SiftMatcher
 
 SINUS = "example_training_data_root/bag_1/_start_004259_end_004629_stride_25_segment_13"
 
@@ -115,3 +117,33 @@ def test_the_closed_form_on_a_real_c3vd_frame_is_as_good_as_measured(realdata):
     assert errors["share_of_truth"] > 0.98
     constant = evaluate_depth(ConstantModel()(frame), frame)
     assert errors["abs_rel_median"] < 0.6 * constant["abs_rel_median"]
+
+
+def test_real_frames_are_kept_and_blurred_copies_among_them_rejected(realdata):
+    """Twelve sharp frames, six moved ones, twelve sharp, six out of focus, eleven sharp."""
+    map_folder = realdata / "sinus" / "derived_colmap" / "sparse_txt" / "0"
+    real = read_once(realdata / "sinus" / SINUS, map_folder)
+
+    def spoilt(frame: Frame, how: str) -> Frame:
+        if how == "moved":
+            return replace(frame, image=cv2.blur(frame.image, (121, 1)))
+        return replace(frame, image=cv2.GaussianBlur(frame.image, (0, 0), 20)) if how else frame
+
+    shown = [(i, "") for i in range(12)] + [(i, "moved") for i in range(12, 18)]
+    shown += [(i, "") for i in range(12, 24)] + [(i, "unfocused") for i in range(24, 30)]
+    shown += [(i, "") for i in range(24, 35)]
+
+    class Shown(list):
+        def __getitem__(self, row):
+            return spoilt(real[shown[row][0]], shown[row][1])
+
+    names = [f"{row:06d}" for row in range(len(shown))]
+    verdicts = select_by_matching(Shown(), names, OrientationDescriptor(), SiftMatcher(), SIFT_NODES)
+    kept, sharp = np.array([v.kept for v in verdicts]), np.array([not how for _, how in shown])
+    assert kept[sharp].mean() >= 0.9 and not kept[~sharp].any()
+
+
+def test_the_real_map_vouches_for_all_of_its_frames(realdata):
+    map_folder = realdata / "sinus" / "derived_colmap" / "sparse_txt" / "0"
+    verdicts = select_by_map(read_once(realdata / "sinus" / SINUS, map_folder).names, read_map(map_folder), MapRules())
+    assert all(v.kept for v in verdicts)

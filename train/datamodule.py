@@ -7,7 +7,7 @@ resumed run sees what an uninterrupted one would have seen.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -70,7 +70,8 @@ class FrameDataModule(pl.LightningDataModule):
         val_sequences: folders to validate on; without any, the last tenth of each training sequence is held out.
         split: a split file (data/*/splits/*.yaml) in place of both; its train and val are read, its test never is.
         root: the folder that holds the split's sequences.
-        frames: a file with one frame name a line; training takes only these.
+        frames: a file with one frame name a line, as `select` writes it; training takes exactly these, and what is held
+            out to validate on comes from them. `folder/name` where several sequences have frames of one name.
         tube: synthetic colons.
         size: width and height of the images, pixels.
         batch_size: frames in a step.
@@ -116,17 +117,26 @@ class FrameDataModule(pl.LightningDataModule):
             return
         train: list[Dataset] = []
         val: list[Dataset] = []
-        wanted = None if self.frames is None else read_frame_list(Path(self.frames))
         to_train, to_validate = self._folders()
-        for path, of in to_train:
-            chosen = _chosen(_open(path, of), wanted, path)
+        opened = [(path, _open(path, of)) for path, of in to_train]
+        rows = [list(range(len(frames))) for _, frames in opened]
+        if self.frames is not None:
+            if len(dict(opened)) < len(opened):
+                raise InputError(f"{self.split}: has one sequence twice in train; --data.frames cannot tell them apart")
+            rows = list(listed_rows(Path(self.frames), dict(opened)).values())
+        for (path, frames), listed in zip(opened, rows, strict=True):
+            if not listed:
+                raise InputError(f"{path}: none of its frames is listed in {self.frames}; leave it out, or list some")
+            chosen = [_Reader(frames, i, frames.names[i]) for i in listed]
             held_out = 0 if to_validate else max(1, len(chosen) // 10)
             if len(chosen) <= held_out:
                 raise InputError(f"{path}: {len(chosen)} frame; expected at least two, one of them to validate on")
             train.append(_Frames(chosen[: len(chosen) - held_out], self.size, path))
             if held_out:
                 val.append(_Frames(chosen[-held_out:], self.size, path))
-        val += [_Frames(_chosen(_open(path, of), None, path), self.size, path) for path, of in to_validate]
+        for path, of in to_validate:
+            frames = _open(path, of)
+            val.append(_Frames([_Reader(frames, i, name) for i, name in enumerate(frames.names)], self.size, path))
         if self.tube.scenes + self.tube.val_scenes > 0:
             with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
                 first = self.seed * _SEEDS_APART
@@ -281,16 +291,39 @@ def _open(path: str, of: Listed | None = None) -> FrameSequence:
     return frames.at(rows)
 
 
-def _chosen(frames: FrameSequence, wanted: list[str] | None, path: str) -> list[_Reader]:
-    """Readers of the frames whose name (or its last part) is on the list, or of all."""
-    names = frames.names
-    if wanted is None:
-        return [_Reader(frames, i, name) for i, name in enumerate(names)]
-    listed = {Path(name).stem for name in wanted}
-    found = [_Reader(frames, i, name) for i, name in enumerate(names) if Path(name).stem in listed]
-    if not found:
-        raise InputError(f"{path}: none of the {len(wanted)} listed frames is in it; its first is {names[0]}")
-    return found
+def listed_rows(path: Path, sequences: Mapping[str, FrameSequence]) -> dict[str, list[int]]:
+    """Rows of the listed frames in each sequence, in its order; a frame's ending does not count.
+
+    An entry `folder/name` is a frame of the sequence whose path ends in `folder`. Raises InputError for one that is in
+    no sequence, or in several.
+    """
+    rows: dict[str, set[int]] = {where: set() for where in sequences}
+    known: dict[str, list[tuple[str, int]]] = {}
+    for where, frames in sequences.items():
+        for i, name in enumerate(frames.names):
+            known.setdefault(_stem(name), []).append((where, i))
+    found: dict[str, list[tuple[str, int]]] = {}
+    for entry in read_frame_list(path):
+        *folders, name = entry.replace("\\", "/").split("/")
+        ends = {where: Path(where).resolve().parts[-len(folders) :] == tuple(folders) for where in sequences}
+        found[entry] = [(where, i) for where, i in known.get(_stem(name), []) if not folders or ends[where]]
+    if not any(found.values()):
+        raise InputError(f"{path}: none of the {len(found)} listed frames is in {' or '.join(sequences)}")
+    for entry, places in found.items():
+        if not places:
+            raise InputError(f"{path}: {entry} is not a frame of {' or '.join(sequences)}")
+        if len(places) > 1:
+            raise InputError(f"{path}: {entry} is in {' and in '.join(w for w, _ in places)}; write folder/name")
+        rows[places[0][0]].add(places[0][1])
+    return {where: sorted(chosen) for where, chosen in rows.items()}
+
+
+def _stem(name: str) -> str:
+    """The name without folder and without the ending of an image; dots in names are kept."""
+    from lightdepth.datasets.sequence import IMAGE_SUFFIXES
+
+    last = Path(name)
+    return last.stem if last.suffix.lower() in IMAGE_SUFFIXES else last.name
 
 
 @dataclass(frozen=True)

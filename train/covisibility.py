@@ -1,0 +1,304 @@
+"""Which frames are worth training on: those that see what other frames see.
+
+Walls too near, water, stool and blur match nothing; a frame that many others are covisible with is a good one. With
+frames alone this is ColonMapper's mapping (Morlana, Tardós and Montiel): consecutive frames gather in a node while they
+match; a node with few views is thrown away with all its frames. With a sparse map, its covisibility graph says it.
+
+A node has views, against which new frames are compared, and frames, which are its views and what lies between them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame, frame_number
+from lightdepth.sparse_map import SparseMap, Submap, covisibility
+
+from .matching import Agreement, Descriptor, Matcher
+
+BLUR, NO_MATCHES, FEW_VIEWS, UNREADABLE = "blur", "no matches", "too few views", "unreadable"
+NOT_IN_MAP, FEW_KEYFRAMES = "not in the map", "too few covisible keyframes"
+
+
+@dataclass(frozen=True)
+class NodeRules:
+    """When a frame belongs to a node, and which nodes are kept.
+
+    Args:
+        similarity: cosine to a view of the node above which a frame is alike, and not matched
+        min_matches: more matches than this make two frames covisible
+        min_spread: and they lie in at least this share of the image's cells
+        min_views: of a node that is kept
+        max_skipped: alike frames in a row; the next is matched all the same
+        min_frames: from one view of a node to the next; a covisible frame that comes sooner is a frame of the node only
+        max_views: a node with more than these is closed
+        reference: the view that frames are matched with, the node's last or middle one
+        blur: frames with fewer features than this share of the kept ones' median are blur, and rejected whatever they
+            match: moved or out of focus alike, they match each other
+    """
+
+    similarity: float = 0.98
+    min_matches: int = 15
+    min_spread: float = 0.2
+    min_views: int = 3
+    max_skipped: int = 1
+    min_frames: int = 1
+    max_views: int = 29
+    reference: Literal["last", "middle"] = "last"
+    blur: float = 0.5
+
+    def __post_init__(self) -> None:
+        if min(self.min_views, self.min_frames, self.max_views) < 1 or min(self.min_matches, self.max_skipped) < 0:
+            raise InputError(f"{self}: expected min_views, min_frames and max_views of at least 1, and nothing below 0")
+        if self.max_views < self.min_views - 1:
+            raise InputError(f"max_views {self.max_views}: no node could have min_views {self.min_views}")
+
+
+# Calibrated on the synthetic colons of tests/benchmarks/bench_select.py, seeds 100 to 107.
+SIFT_NODES = NodeRules()
+# ColonMapper's published values, for EndoMapper; confidence 0.4 is in LoftrSettings. Its video is not thinned.
+LOFTR_NODES = NodeRules(
+    similarity=0.92, min_matches=100, min_spread=0.0, min_views=3, max_skipped=7, min_frames=4, max_views=9
+)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One frame: kept, or the reason why not. `node` counts nodes, or is the submap's id; `similarity` is the largest
+    cosine to the node's views, `matches` and `spread` are with its reference view; None where not looked at."""
+
+    name: str
+    kept: bool
+    reason: str = ""
+    node: int | None = None
+    view: bool = False
+    similarity: float | None = None
+    matches: int | None = None
+    spread: float | None = None
+    features: int | None = None
+
+
+@dataclass
+class _Node:
+    """The node that is being filled."""
+
+    id: int
+    frames: list[int]
+    views: list[tuple[int, np.ndarray, Any]]
+    skipped: int = 0
+
+    @property
+    def updated(self) -> int:
+        return self.views[-1][0]
+
+    def similarity(self, descriptor: np.ndarray) -> float:
+        return max(float(descriptor @ view) for _, view, _ in self.views)
+
+    def reference(self, which: str) -> Any:
+        return self.views[-1 if which == "last" else len(self.views) // 2][2]
+
+
+@dataclass
+class _Seen:
+    """What is remembered of a frame."""
+
+    name: str
+    node: int | None = None
+    view: bool = False
+    similarity: float | None = None
+    agreement: Agreement | None = None
+    features: int | None = None
+
+
+def select_by_matching(
+    frames: Sequence[Frame],
+    names: Sequence[str],
+    descriptor: Descriptor,
+    matcher: Matcher,
+    rules: NodeRules,
+    advance: Callable[[], None] = lambda: None,
+) -> list[Verdict]:
+    """A verdict for every frame, in order. Each frame is read and described once; images are not kept.
+
+    A frame that cannot be read is rejected; raises InputError when none can.
+    """
+    seen: list[_Seen] = []
+    views_in: Counter[int] = Counter()
+    node: _Node | None = None
+    trouble = ""
+    for i, name in enumerate(names):
+        advance()
+        seen.append(_Seen(name))
+        try:
+            frame = frames[i]
+        except InputError as error:
+            trouble = trouble or str(error)
+            continue
+        described, kept = descriptor(frame), matcher.keep(frame)
+        seen[i].features = matcher.count(kept)
+        node = _into_node(i, described, kept, node, seen[i], matcher, rules)
+        if node is None or node.frames[-1] != i:
+            node = _Node(len(views_in), [i], [(i, described, kept)])
+        seen[i].node, seen[i].view = node.id, node.updated == i
+        views_in[node.id] = len(node.views)
+        if len(node.views) > rules.max_views:
+            node = None
+    if not views_in:
+        raise InputError(f"no frame could be read; the first: {trouble}")
+    good = {id for id, views in views_in.items() if views >= rules.min_views}
+    counts = [s.features for s in seen if s.node in good and s.features is not None]
+    least = rules.blur * float(np.median(counts)) if counts else 0.0
+    blurred = [s.features is not None and s.features < least for s in seen]
+    sharp_views = Counter(s.node for s, blur in zip(seen, blurred, strict=True) if s.view and not blur)
+    good = {id for id in good if sharp_views[id] >= rules.min_views}
+    return [_verdict(s, blur, views_in, good) for s, blur in zip(seen, blurred, strict=True)]
+
+
+def _into_node(
+    i: int, described: np.ndarray, kept: Any, node: _Node | None, seen: _Seen, matcher: Matcher, rules: NodeRules
+) -> _Node | None:
+    """The node with frame `i` in it where it belongs there; else as it was."""
+    if node is None:
+        return None
+    seen.similarity = node.similarity(described)
+    if seen.similarity > rules.similarity and node.skipped < rules.max_skipped:
+        node.skipped += 1
+        node.frames.append(i)
+        return node
+    seen.agreement = agreement = matcher.agree(node.reference(rules.reference), kept)
+    if agreement.matches > rules.min_matches and agreement.spread >= rules.min_spread:
+        node.frames.append(i)
+        node.skipped = 0
+        if i - node.updated >= rules.min_frames:
+            node.views.append((i, described, kept))
+    return node
+
+
+def _verdict(seen: _Seen, blurred: bool, views_in: Counter[int], good: set[int]) -> Verdict:
+    matches, spread = seen.agreement or (None, None)
+    found = Verdict(
+        seen.name,
+        seen.node in good and not blurred,
+        "",
+        seen.node,
+        seen.view,
+        seen.similarity,
+        matches,
+        spread,
+        seen.features,
+    )
+    if found.kept:
+        return found
+    if seen.node is None:
+        return replace(found, reason=UNREADABLE)
+    if blurred:
+        return replace(found, reason=BLUR)
+    return replace(found, reason=NO_MATCHES if views_in[seen.node] == 1 else FEW_VIEWS)
+
+
+@dataclass(frozen=True)
+class MapRules:
+    """Which frames a sparse map vouches for.
+
+    Args:
+        points: two keyframes with at least this many points in common are covisible
+        keyframes: a keyframe is kept with at least this many covisible others
+        between: frames between two kept, covisible keyframes that follow each other are kept where these are at most
+            this many frames apart; 1 keeps keyframes only
+        published: take the pairs of camerasModel.txt (EndoMapper), where it is beside the model, instead of `points`
+    """
+
+    points: int = 15
+    keyframes: int = 2
+    between: int = 40
+    published: bool = True
+
+    def __post_init__(self) -> None:
+        if min(self.points, self.keyframes, self.between) < 1:
+            raise InputError(f"{self}: expected points, keyframes and between of at least 1")
+
+
+def select_by_map(
+    names: Sequence[str],
+    sparse_map: SparseMap,
+    rules: MapRules,
+    published: Mapping[int, Mapping[int, set[int]]] | None = None,
+) -> list[Verdict]:
+    """A verdict for every frame, in order. `published` holds, for submaps by id, the covisible frame numbers of each.
+
+    A keyframe of several submaps is kept when one of them keeps it. Raises InputError when the map has none of the
+    frames.
+    """
+    numbers = [frame_number(name) for name in names]
+    found: dict[int, Verdict] = {}
+    for submap in sparse_map.submaps:
+        given = (published or {}).get(submap.id) if rules.published else None
+        keyframes = [k.number for k in submap.keyframes]
+        covisible = _counted(submap, rules.points) if given is None else _listed(keyframes, given)
+        others = covisible.sum(1)
+        kept = {n for n, count in zip(keyframes, others, strict=True) if count >= rules.keyframes}
+        for n, count in zip(keyframes, others, strict=True):
+            reason = "" if n in kept else FEW_KEYFRAMES
+            _best(found, n, Verdict("", n in kept, reason, submap.id, True, None, int(count)))
+        order = np.argsort(keyframes)
+        for a, b in pairwise(order):
+            first, last = keyframes[a], keyframes[b]
+            if {first, last} <= kept and covisible[a, b] and last - first <= rules.between:
+                for n in range(first + 1, last):
+                    _best(found, n, Verdict("", True, "", submap.id))
+    if not found.keys() & set(numbers):
+        raise InputError(
+            f"{sparse_map.source}: its keyframes ({min(found)} to {max(found)}) are none of the {len(names)} frames "
+            f"({min(numbers)} to {max(numbers)}); frames and keyframes meet by the number in their names"
+        )
+    missing = Verdict("", False, NOT_IN_MAP)
+    return [replace(found.get(n, missing), name=name) for n, name in zip(numbers, names, strict=True)]
+
+
+def _best(found: dict[int, Verdict], number: int, verdict: Verdict) -> None:
+    before = found.get(number)
+    if before is None or (verdict.kept, verdict.matches or 0) > (before.kept, before.matches or 0):
+        found[number] = verdict
+
+
+def _counted(submap: Submap, points: int) -> np.ndarray:
+    shared = covisibility(submap) >= points
+    np.fill_diagonal(shared, False)
+    return shared
+
+
+def _listed(keyframes: list[int], given: Mapping[int, set[int]]) -> np.ndarray:
+    pairs = np.array([[b in given.get(a, ()) or a in given.get(b, ()) for b in keyframes] for a in keyframes])
+    np.fill_diagonal(pairs, False)
+    return pairs
+
+
+def published_pairs(folder: Path, sparse_map: SparseMap) -> dict[int, dict[int, set[int]]]:
+    """The pairs of camerasModel.txt, where it is beside a model: for submaps by id, the frames covisible with each.
+
+    A line is `NAME covisible covisible ...`, image names, itself among them. Raises InputError when one has no number.
+    """
+    pairs = {}
+    for submap in sparse_map.submaps:
+        places = [folder / str(submap.id), folder / "sparse" / str(submap.id)]
+        places += [folder, folder / "sparse"] if len(sparse_map.submaps) == 1 else []
+        files = [place / "camerasModel.txt" for place in places if (place / "camerasModel.txt").is_file()]
+        if not files:
+            continue
+        try:
+            lines = [line.split() for line in files[0].read_text().splitlines() if line.strip()]
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{files[0]}: cannot be read ({error})") from error
+        try:
+            pairs[submap.id] = {frame_number(first): {frame_number(n) for n in rest} for first, *rest in lines}
+        except InputError as error:
+            raise InputError(f"{files[0]}: {error}; expected lines NAME COVISIBLE COVISIBLE ...") from error
+    return pairs

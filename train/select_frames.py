@@ -1,0 +1,191 @@
+"""`lightdepth select`: the list of frames worth training on, a table of why, and a page to look at.
+
+LIST (names, one a line), and beside it STEM.csv (one row a frame), STEM_contact.png and STEM.html.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, astuple, fields
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.errors import InputError
+from lightdepth.figures import BAD, GOOD, contact_sheet, png, thumbnail
+from lightdepth.maps import read_map
+from lightdepth.progress import Progress
+from lightdepth.report import Report
+from lightdepth.sparse_map import SparseMap
+
+from .covisibility import (
+    LOFTR_NODES,
+    SIFT_NODES,
+    MapRules,
+    NodeRules,
+    Verdict,
+    published_pairs,
+    select_by_map,
+    select_by_matching,
+)
+from .matching import LoftrMatcher, LoftrSettings, Matcher, OrientationDescriptor, SiftMatcher, SiftSettings
+
+_SHOWN = 48  # pictures of kept and of rejected frames each
+
+
+def select(
+    data: Path,
+    output: Path,
+    map: Path | None = None,
+    matcher: Literal["sift", "loftr"] = "sift",
+    format: str | None = None,
+    camera: Path | None = None,
+    mask: Path | None = None,
+    sift: SiftSettings = SiftSettings(),
+    sift_nodes: NodeRules = SIFT_NODES,
+    loftr: LoftrSettings = LoftrSettings(),
+    loftr_nodes: NodeRules = LOFTR_NODES,
+    map_rules: MapRules = MapRules(),
+    with_folder: bool = False,
+    no_frames: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """The frames worth training on, by covisibility: not blur, water, stool, nor walls too near.
+
+    Args:
+        data: folder of frames
+        output: list to write, with a table (.csv), a contact sheet (_contact.png) and a page (.html) beside it
+        map: COLMAP model(s) or a multi-map tree, whose covisibility decides instead of matching images
+        matcher: sift, or loftr with --loftr.weights
+        format: folder, c3vd, simcol, hamlyn or endomapper; found by looking when left out
+        camera: calibration file that wins over the folder's
+        mask: image, white where tissue shows
+        sift: features of the sift matcher
+        sift_nodes: what is covisible and what is kept, with the sift matcher
+        loftr: the loftr matcher
+        loftr_nodes: what is covisible and what is kept, with the loftr matcher
+        map_rules: what is kept, with --map
+        with_folder: write names as folder/name, so that lists of several sequences can be joined
+        no_frames: leave the pictures out
+        overwrite: replace files made before
+    """
+    paths = _paths(output, no_frames, overwrite)
+    sparse_map = read_map(map) if map is not None else None
+    map_camera = sparse_map.submaps[0].keyframes[0].camera if sparse_map is not None else None
+    frames = open_sequence(data, format, camera, None, mask, map_camera)
+    settings: dict[str, object]
+    if sparse_map is not None and map is not None:
+        verdicts, how = _by_map(frames, sparse_map, map, map_rules)
+        settings = {"map": str(map), **asdict(map_rules)}
+    else:
+        used: Matcher = SiftMatcher(sift) if matcher == "sift" else LoftrMatcher(loftr)
+        nodes = sift_nodes if matcher == "sift" else loftr_nodes
+        settings = {"matcher": matcher, **asdict(nodes), **asdict(sift if matcher == "sift" else loftr)}
+        how = f"frames matched with {matcher}"
+        with Progress("Selecting", len(frames)) as bar:
+            verdicts = select_by_matching(frames, frames.names, OrientationDescriptor(), used, nodes, bar.advance)
+    if not any(v.kept for v in verdicts):
+        raise InputError(f"{data}: none of the {len(verdicts)} frames is kept ({_counts(verdicts)}); nothing written")
+    summary = f"{sum(v.kept for v in verdicts)} of {len(verdicts)} frames kept; rejected: {_counts(verdicts)}"
+    folder = f"{data.resolve().name}/" if with_folder else ""
+    header = [f"{data}: {summary}", how, *(f"{name}: {value}" for name, value in settings.items() if value is not None)]
+    listed = [f"# {' '.join(line.split())}" for line in header] + [f"{folder}{v.name}" for v in verdicts if v.kept]
+
+    picture = None if no_frames else _sheet(frames, verdicts)
+    page = _page(data, summary, how, settings, verdicts, picture)
+    writers: dict[Path, Callable[[Path], object]] = {
+        paths["table"]: lambda p: p.write_text(_table(verdicts)),
+        paths["page"]: page.write,
+        paths["list"]: lambda p: p.write_text("\n".join(listed) + "\n"),  # last: its presence means all is there
+    }
+    if picture is not None:
+        writers = {paths["sheet"]: lambda p: p.write_bytes(picture), **writers}
+    _write(writers)
+    if no_frames:
+        paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
+    print(f"{summary}\n{', '.join(str(path) for path in writers)}")
+
+
+def _paths(output: Path, no_frames: bool, overwrite: bool) -> dict[str, Path]:
+    if output.is_dir() or output.suffix in (".csv", ".html", ".png"):
+        raise InputError(f"-o {output}: expected the name of a list to write, such as frames.txt")
+    beside = output.parent / output.stem
+    paths = {"list": output}
+    for what, ending in (("table", ".csv"), ("sheet", "_contact.png"), ("page", ".html")):
+        paths[what] = beside.with_name(beside.name + ending)
+    there = [path for path in paths.values() if path.exists()]
+    if there and not overwrite:
+        raise InputError(f"{there[0]}: already there; choose another -o, or give --overwrite")
+    return paths
+
+
+def _write(writers: dict[Path, Callable[[Path], object]]) -> None:
+    """All files beside their places first; nothing takes its place before all are written."""
+    partial = {path: path.with_name(f".{path.name}.partial") for path in writers}
+    try:
+        for path, write in writers.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(partial[path])
+        for path in writers:
+            os.replace(partial[path], path)
+    except OSError as error:
+        raise InputError(f"{next(iter(writers)).parent}: cannot be written to ({error.strerror})") from error
+    finally:
+        for path in partial.values():
+            path.unlink(missing_ok=True)
+
+
+def _by_map(frames: FrameSequence, sparse_map: SparseMap, folder: Path, rules: MapRules) -> tuple[list[Verdict], str]:
+    pairs = published_pairs(folder, sparse_map) if rules.published else {}
+    how = f"covisibility of {sparse_map.source}" + (" by its camerasModel.txt" if pairs else "")
+    return select_by_map(frames.names, sparse_map, rules, pairs), how
+
+
+def _counts(verdicts: Sequence[Verdict]) -> str:
+    counts = Counter(v.reason for v in verdicts if not v.kept)
+    return ", ".join(f"{count} {reason}" for reason, count in counts.most_common()) or "none"
+
+
+def _table(verdicts: Sequence[Verdict]) -> str:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow([f.name for f in fields(Verdict)])
+    for verdict in verdicts:
+        row = [int(v) if isinstance(v, bool) else f"{v:.4f}" if isinstance(v, float) else v for v in astuple(verdict)]
+        writer.writerow(row)
+    return buffer.getvalue()
+
+
+def _sheet(frames: FrameSequence, verdicts: Sequence[Verdict]) -> bytes:
+    """Kept and rejected frames in order, spread over the sequence. Read again: keeping them would fill the memory."""
+    rows = []
+    for kept in (True, False):
+        readable = [i for i, v in enumerate(verdicts) if v.kept == kept and v.reason != "unreadable"]
+        rows += [readable[i] for i in np.linspace(0, len(readable) - 1, min(_SHOWN, len(readable))).astype(int)]
+    rows.sort()
+    pictures = [thumbnail(frames[i].image, 160) for i in rows]
+    labels = [f"{verdicts[i].name[-14:]} {verdicts[i].reason}"[:28] for i in rows]
+    return png(contact_sheet(pictures, labels, [GOOD if verdicts[i].kept else BAD for i in rows]))
+
+
+def _page(
+    data: Path, summary: str, how: str, settings: dict[str, object], verdicts: Sequence[Verdict], picture: bytes | None
+) -> Report:
+    page = Report("Frames worth training on")
+    page.text(f"{data}, {how}: {summary}.")
+    counts = Counter("kept" if v.kept else v.reason for v in verdicts)
+    page.table(["", "frames", "share"], [[what, n, n / len(verdicts)] for what, n in counts.most_common()])
+    if any(v.reason == "blur" for v in verdicts):
+        page.text("Blur stands for all that shows little detail: blur, water, cover, and walls too near.")
+    if picture is not None:
+        page.heading("Kept (green) and rejected (red)")
+        page.wide_figures([(picture, f"At most {_SHOWN} of each, spread over the sequence, in its order")])
+    page.heading("Settings")
+    page.table(["", "value"], [[name, str(value)] for name, value in settings.items() if value is not None])
+    return page
