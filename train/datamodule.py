@@ -20,7 +20,7 @@ from torch.utils.data import ConcatDataset, DataLoader, Dataset, Sampler
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.datasets.splits import Chosen, Split, check_apart, folders, read_split
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame, FrameBatch, flipped, to_batch
+from lightdepth.frame import FrameBatch, flipped, to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.photometry import LightTerms, brightness, decode, encode
 from lightdepth.progress import Progress
@@ -127,7 +127,7 @@ class FrameDataModule(pl.LightningDataModule):
         for (path, frames), listed in zip(opened, rows, strict=True):
             if not listed:
                 raise InputError(f"{path}: none of its frames is listed in {self.frames}; leave it out, or list some")
-            chosen = [_Reader(frames, i, frames.names[i]) for i in listed]
+            chosen = frames.at(listed)
             held_out = 0 if to_validate else max(1, len(chosen) // 10)
             if len(chosen) <= held_out:
                 raise InputError(f"{path}: {len(chosen)} frame; expected at least two, one of them to validate on")
@@ -135,8 +135,7 @@ class FrameDataModule(pl.LightningDataModule):
             if held_out:
                 val.append(_Frames(chosen[-held_out:], self.size, path))
         for path, of in to_validate:
-            frames = _open(path, of)
-            val.append(_Frames([_Reader(frames, i, name) for i, name in enumerate(frames.names)], self.size, path))
+            val.append(_Frames(_open(path, of), self.size, path))
         if self.tube.scenes + self.tube.val_scenes > 0:
             with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
                 first = self.seed * _SEEDS_APART
@@ -326,30 +325,18 @@ def _stem(name: str) -> str:
     return last.stem if last.suffix.lower() in IMAGE_SUFFIXES else last.name
 
 
-@dataclass(frozen=True)
-class _Reader:
-    """One frame of a sequence, not read yet. No closure: processes are handed it."""
-
-    frames: Sequence[Frame]
-    index: int
-    name: str
-
-    def __call__(self) -> Frame:
-        return self.frames[self.index]
-
-
 class _Frames(Dataset):
     """Frames read when asked for, at one size."""
 
-    def __init__(self, readers: list[_Reader], size: tuple[int, int], path: str) -> None:
-        self.readers, self.size = readers, size
-        self.names = [f"{path}: {reader.name}" for reader in readers]
+    def __init__(self, frames: FrameSequence, size: tuple[int, int], path: str) -> None:
+        self.frames, self.size = frames, size
+        self.names = [f"{path}: {name}" for name in frames.names]
 
     def __len__(self) -> int:
-        return len(self.readers)
+        return len(self.frames)
 
     def __getitem__(self, index: int) -> FrameBatch:
-        return to_batch(self.readers[index](), self.size)
+        return to_batch(self.frames[index], self.size)
 
 
 class _Cached(Dataset):

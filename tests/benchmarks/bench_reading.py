@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 from lightdepth.datasets import open_sequence, write_c3vd
 from lightdepth.datasets.c3vd import C3VD
 from lightdepth.frame import Frame
-from train.datamodule import _chosen, _Frames, collate
+from train.datamodule import _Frames, collate
 
 AT_LEAST = 0.8
 """Least share of the bare rate."""
@@ -74,7 +74,7 @@ def test_frames_are_read_almost_as_fast_as_bare_images(sequence, workers, capsys
     options = {"batch_size": BATCH, "num_workers": workers, "persistent_workers": workers > 0}
     ours, area, linear = rates(
         [
-            DataLoader(_Frames(_chosen(open_sequence(sequence), None, "seq"), SIZE), collate_fn=collate, **options),
+            DataLoader(_Frames(open_sequence(sequence), SIZE, "seq"), collate_fn=collate, **options),
             DataLoader(Bare(files, cv2.INTER_AREA), **options),
             DataLoader(Bare(files, cv2.INTER_LINEAR), **options),
         ]
