@@ -15,7 +15,7 @@ import train.fit as fit_module
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import load_model, read_card
-from lightdepth.datasets import write_c3vd, write_folder
+from lightdepth.datasets import open_sequence, write_c3vd, write_folder
 from lightdepth.datasets.endomapper import write_endomapper
 from lightdepth.decline import log_closed_form
 from lightdepth.errors import InputError, PartialFailure
@@ -101,6 +101,27 @@ def test_synthetic_colons_follow_from_the_seed_and_validation_colons_are_others(
     assert torch.equal(train_a.image, train_b.image)
     assert not torch.equal(train_a.image, train_c.image) and not torch.equal(train_a.image, val_a.image)
     assert train_a.true_valid.any()
+
+
+def test_sequences_without_a_calibration_are_read_with_the_one_that_is_given(tmp_path):
+    whole = write_sequence(tmp_path / "seq")
+    bare = tmp_path / "bare"
+    (bare / "frames").mkdir(parents=True)
+    for image in (whole / "frames").iterdir():
+        (bare / "frames" / image.name).write_bytes(image.read_bytes())
+    with pytest.raises(InputError, match=r"no camera\.json"):
+        FrameDataModule([str(bare)], size=(40, 32)).setup()
+    white = np.full(open_sequence(whole)[0].image.shape[:2], 255, np.uint8)
+    white[:8] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), white)
+    given = {"camera": str(whole / "camera.json"), "light": "gamma=1.7,mu=0.5", "mask": str(tmp_path / "mask.png")}
+    data = FrameDataModule([str(bare)], size=(40, 32), **given)
+    data.setup()
+    batch = next(iter(data.val_dataloader()))
+    assert batch.light.gamma.unique() == torch.tensor(1.7) and batch.light.mu.unique() == 0.5
+    assert not batch.mask[:, :, :2].any() and batch.mask[:, :, 8:].any()
+    with pytest.raises(InputError, match="C3VD"):
+        FrameDataModule([str(bare)], size=(40, 32), format="c3vd", **given).setup()
 
 
 def test_training_frames_can_be_chosen_by_a_list(tmp_path):

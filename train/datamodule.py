@@ -72,6 +72,11 @@ class FrameDataModule(pl.LightningDataModule):
         root: the folder that holds the split's sequences.
         frames: a file with one frame name a line, as `select` writes it; training takes exactly these, and what is held
             out to validate on comes from them. `folder/name` where several sequences have frames of one name.
+        format: of the sequences: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if
+            left out.
+        camera: calibration file of all the sequences, which wins over their own.
+        light: light.json, photometric XML, or gamma=2.2,mu=0, likewise.
+        mask: image, white where tissue shows, likewise.
         tube: synthetic colons.
         size: width and height of the images, pixels.
         batch_size: frames in a step.
@@ -87,6 +92,10 @@ class FrameDataModule(pl.LightningDataModule):
         split: str | None = None,
         root: str | None = None,
         frames: str | None = None,
+        format: str | None = None,
+        camera: str | None = None,
+        light: str | None = None,
+        mask: str | None = None,
         tube: TubeData = _NO_TUBE,
         size: tuple[int, int] = (160, 128),
         batch_size: int = 4,
@@ -97,6 +106,7 @@ class FrameDataModule(pl.LightningDataModule):
         super().__init__()
         self.sequences, self.val_sequences = sequences or [], val_sequences or []
         self.split, self.root = split, root
+        self.reading = Reading(format, camera, light, mask)
         self.frames, self.tube, self.seed = frames, tube, seed
         self.size, self.batch_size, self.num_workers = (int(size[0]), int(size[1])), batch_size, num_workers
         self.augment = augment
@@ -118,7 +128,7 @@ class FrameDataModule(pl.LightningDataModule):
         train: list[Dataset] = []
         val: list[Dataset] = []
         to_train, to_validate = self._folders()
-        opened = [(path, _open(path, of)) for path, of in to_train]
+        opened = [(path, _open(path, of, self.reading)) for path, of in to_train]
         rows = [list(range(len(frames))) for _, frames in opened]
         if self.frames is not None:
             if len(dict(opened)) < len(opened):
@@ -135,7 +145,7 @@ class FrameDataModule(pl.LightningDataModule):
             if held_out:
                 val.append(_Frames(chosen[-held_out:], self.size, path))
         for path, of in to_validate:
-            val.append(_Frames(_open(path, of), self.size, path))
+            val.append(_Frames(_open(path, of, self.reading), self.size, path))
         if self.tube.scenes + self.tube.val_scenes > 0:
             with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
                 first = self.seed * _SEEDS_APART
@@ -275,11 +285,24 @@ class Listed:
     chosen: Chosen
 
 
-def _open(path: str, of: Listed | None = None) -> FrameSequence:
+@dataclass(frozen=True)
+class Reading:
+    """How sequences are read: what is given wins over what is in their folders."""
+
+    format: str | None = None
+    camera: str | None = None
+    light: str | None = None
+    mask: str | None = None
+
+    def open(self, path: str, format: str | None = None) -> FrameSequence:
+        return open_sequence(path, self.format or format, self.camera, self.light, self.mask)
+
+
+def _open(path: str, of: Listed | None, reading: Reading) -> FrameSequence:
     if of is None:
-        return open_sequence(path)
+        return reading.open(path)
     info, expected = of.split.info, of.split.frame_count(of.chosen.name)
-    frames = open_sequence(path, None if info is None else info.format)
+    frames = reading.open(path, None if info is None else info.format)
     if expected is not None and len(frames) != expected:
         warnings.warn(f"{path}: {len(frames)} frames; the data set has {expected}. Is it there whole?", stacklevel=2)
     rows = [i for i, number in enumerate(frames.numbers) if of.chosen.takes(number)]
