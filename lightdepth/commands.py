@@ -24,6 +24,7 @@ from lightdepth.light_page import light_page
 from lightdepth.light_truth import fit_on_truth
 from lightdepth.maps import read_map, write_multimap
 from lightdepth.progress import Progress
+from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.run import plain, run_folder
 from lightdepth.tube import lens as tube_lens
 from lightdepth.tube import render_sequence
@@ -209,6 +210,7 @@ def predict(
     camera: Path | None = None,
     light: str | None = None,
     mask: Path | None = None,
+    refine: int = 0,
     previews: bool = True,
     overwrite: bool = False,
 ) -> None:
@@ -222,11 +224,14 @@ def predict(
         camera: calibration file that wins over the folder's
         light: light.json, photometric XML, or gamma=2.2,mu=0, that wins over the folder's
         mask: image, white where tissue shows
+        refine: steps in which each image's distance is improved by its own light; 0 for none
         previews: also write a PNG with image and distance for every frame
         overwrite: replace a folder made before
     """
     arguments = {k: v for k, v in locals().items() if k != "overwrite"}
     model = load_model(checkpoint)
+    if refine:
+        model = RefinedModel(model, RefineConfig(steps=refine))
     frames = open_sequence(data, format, camera, light, mask)
     with run_folder(output, "predict", arguments, overwrite) as run, Progress("Predicting", len(frames)) as bar:
         run.hash_input("data", data)

@@ -57,7 +57,7 @@ class DeclineModel:
         if self.details:
             colour = batch.image / brightness(batch.image).clamp(min=V_FLOOR)
             albedo = decode(colour.clamp(max=1), batch.light.gamma)
-        return _prediction(frame, batch, log_distance, albedo, self.name, self.details)
+        return prediction_of(frame, batch, log_distance, albedo, self.name, self.details)
 
 
 class ConstantModel:
@@ -93,7 +93,7 @@ class NetworkModel:
         batch = to_batch(frame, working_size(frame.camera, self.rows)).to(self.device)
         distance, albedo_hs, log_sigma = self.network.estimate(batch.image, batch.mask, batch.rays, batch.light)
         albedo = hue_saturation_albedo(albedo_hs) if self.details else None
-        return _prediction(frame, batch, distance.log(), albedo, self.name, self.details, log_sigma)
+        return prediction_of(frame, batch, distance.log(), albedo, self.name, self.details, log_sigma)
 
 
 def predict(
@@ -106,7 +106,7 @@ def predict(
             progress(count)
 
 
-def _prediction(
+def prediction_of(
     frame: Frame,
     batch: FrameBatch,
     log_distance: Tensor,
@@ -117,19 +117,19 @@ def _prediction(
 ) -> DepthPrediction:
     """Brings what was computed on a batch of one at the working size to the frame's."""
     size = (frame.camera.width, frame.camera.height)
-    log_distance = _extended(log_distance.float(), batch.mask)
-    normals = _upsampled(normals_from_distance(log_distance.exp(), batch.rays), size) if details else None
+    log_distance = extended(log_distance.float(), batch.mask)
+    normals = upsampled(normals_from_distance(log_distance.exp(), batch.rays), size) if details else None
     if normals is not None:
         normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
     return DepthPrediction(
         name=frame.name,
-        distance=np.exp(_upsampled(log_distance, size)),
+        distance=np.exp(upsampled(log_distance, size)),
         valid=_valid(frame),
         camera=frame.camera,
         source=source,
-        albedo=None if albedo is None else _upsampled(_extended(albedo, batch.mask), size),
+        albedo=None if albedo is None else upsampled(extended(albedo, batch.mask), size),
         normals=normals,
-        uncertainty=None if log_sigma is None else np.exp(_upsampled(_extended(log_sigma, batch.mask), size)),
+        uncertainty=None if log_sigma is None else np.exp(upsampled(extended(log_sigma, batch.mask), size)),
     )
 
 
@@ -140,7 +140,7 @@ def _valid(frame: Frame) -> np.ndarray:
     return frame.valid & (np.maximum(np.maximum(red, green), blue) > V_FLOOR)
 
 
-def _extended(values: Tensor, mask: Tensor, steps: int = 2) -> Tensor:
+def extended(values: Tensor, mask: Tensor, steps: int = 2) -> Tensor:
     """Values (1, C, H, W) continued outside the mask from their neighbours inside, a pixel a step.
 
     A coarse pixel that merges masked ones is invalid as a whole; the rim of the full-size mask interpolates into it.
@@ -154,7 +154,7 @@ def _extended(values: Tensor, mask: Tensor, steps: int = 2) -> Tensor:
     return values
 
 
-def _upsampled(values: Tensor, size: tuple[int, int]) -> np.ndarray:
+def upsampled(values: Tensor, size: tuple[int, int]) -> np.ndarray:
     """(1, C, h, w) -> (H, W, C), or (H, W) of one channel, bilinear; size is (width, height)."""
     array = np.ascontiguousarray(values[0].float().cpu().numpy().transpose(1, 2, 0))
     return cv2.resize(array, size, interpolation=cv2.INTER_LINEAR) if array.shape[1::-1] != size else array.squeeze()
