@@ -25,6 +25,7 @@ ORDER = (
     "convert-camera",
     "select",
     "train",
+    "adapt",
     "predict",
     "sparse",
     "densify",

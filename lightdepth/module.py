@@ -95,13 +95,18 @@ class LightDepth(pl.LightningModule):
     def training_step(self, batch: FrameBatch, batch_idx: int) -> dict[str, Any]:
         if self.freeze_distance:
             self.network.body.eval()
-        distance, albedo_hs, log_sigma = self.estimate(batch)
-        with full_precision(self.device):
-            total, terms = training_loss(distance, albedo_hs, batch, self.loss_config, log_sigma)
+        total, terms, distance = self.batch_loss(batch)
         self.log("train/loss", total)
         self.log_dict({f"train/{name}": value for name, value in terms.items()})
         found = {"terms": {name: value.detach() for name, value in terms.items()}, "distance": distance.detach()}
         return {"loss": total, **found}
+
+    def batch_loss(self, batch: FrameBatch) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+        """What is minimised, its terms, and the distance that it was computed from."""
+        distance, albedo_hs, log_sigma = self.estimate(batch)
+        with full_precision(self.device):
+            total, terms = training_loss(distance, albedo_hs, batch, self.loss_config, log_sigma)
+        return total, terms, distance
 
     def validation_step(self, batch: FrameBatch, batch_idx: int) -> None:
         distance, albedo_hs = self(batch)

@@ -67,7 +67,7 @@ class FrameDataModule(pl.LightningDataModule):
 
     Args:
         sequences: folders to train on.
-        val_sequences: folders to validate on; without any, the last tenth of each training sequence is held out.
+        val_sequences: folders to validate on; without any, the end of each training sequence is held out.
         split: a split file (data/*/splits/*.yaml) in place of both; its train and val are read, its test never is.
         root: the folder that holds the split's sequences.
         frames: a file with one frame name a line, as `select` writes it; training takes exactly these, and what is held
@@ -77,7 +77,9 @@ class FrameDataModule(pl.LightningDataModule):
         camera: calibration file of all the sequences, which wins over their own.
         light: light.json, photometric XML, or gamma=2.2,mu=0, likewise.
         mask: image, white where tissue shows, likewise.
+        held_out: share of each training sequence, at its end, to validate on where there are no validation sequences.
         tube: synthetic colons.
+        halves: every batch holds frames of the sequences first, then as many (or one less) of the synthetic colons.
         size: width and height of the images, pixels.
         batch_size: frames in a step.
         num_workers: processes that read frames.
@@ -96,7 +98,9 @@ class FrameDataModule(pl.LightningDataModule):
         camera: str | None = None,
         light: str | None = None,
         mask: str | None = None,
+        held_out: float = 0.1,
         tube: TubeData = _NO_TUBE,
+        halves: bool = False,
         size: tuple[int, int] = (160, 128),
         batch_size: int = 4,
         num_workers: int = 0,
@@ -109,7 +113,11 @@ class FrameDataModule(pl.LightningDataModule):
         self.reading = Reading(format, camera, light, mask)
         self.frames, self.tube, self.seed = frames, tube, seed
         self.size, self.batch_size, self.num_workers = (int(size[0]), int(size[1])), batch_size, num_workers
-        self.augment = augment
+        self.augment, self.held_out, self.halves = augment, held_out, halves
+        if not 0 < held_out < 1:
+            raise InputError(f"data: held_out {held_out}; expected a share above 0 and below 1")
+        if halves and batch_size < 2:
+            raise InputError("data: halves of a batch of one; expected a batch_size of at least 2")
         if min(*self.size, batch_size) < 1:
             raise InputError(f"data: size {self.size}, batch_size {batch_size}; expected positive numbers")
         if split is not None and (self.sequences or self.val_sequences):
@@ -138,7 +146,7 @@ class FrameDataModule(pl.LightningDataModule):
             if not listed:
                 raise InputError(f"{path}: none of its frames is listed in {self.frames}; leave it out, or list some")
             chosen = frames.at(listed)
-            held_out = 0 if to_validate else max(1, len(chosen) // 10)
+            held_out = 0 if to_validate else held_out_count(len(chosen), self.held_out)
             if len(chosen) <= held_out:
                 raise InputError(f"{path}: {len(chosen)} frame; expected at least two, one of them to validate on")
             train.append(_Frames(chosen[: len(chosen) - held_out], self.size, path))
@@ -191,15 +199,23 @@ class FrameDataModule(pl.LightningDataModule):
     def names(self, epoch: int, batch: int) -> list[str]:
         """Names of the training frames of a batch of an epoch, in a run of one process."""
         assert self._train is not None, "setup() first"
-        order = _Shuffled(len(self._train), self.seed)
+        order = self._order()
         order.set_epoch(epoch)
         everyone = [name for part in self._train.datasets for name in part.names]  # type: ignore[attr-defined]
         first = batch * self.batch_size
         return [everyone[i] for i in list(order)[first : first + self.batch_size]]
 
+    def _order(self) -> _Shuffled:
+        assert self._train is not None
+        colons = sum(len(part) for part in self._train.datasets if isinstance(part, _Cached))  # type: ignore[arg-type]
+        frames = len(self._train) - colons
+        if self.halves and frames and colons:
+            return _Halves(frames, colons, self.batch_size, self.seed)
+        return _Shuffled(len(self._train), self.seed)
+
     def train_dataloader(self) -> DataLoader:
         assert self._train is not None
-        sampler = _Shuffled(len(self._train), self.seed)
+        sampler = self._order()
         full = len(self._train) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
         return self._loader(self._train, sampler=sampler, drop_last=full)
 
@@ -225,6 +241,11 @@ class FrameDataModule(pl.LightningDataModule):
             collate_fn=collate,
             **options,
         )
+
+
+def held_out_count(frames: int, share: float) -> int:
+    """How many frames at the end of a sequence are held out."""
+    return max(1, int(share * frames))
 
 
 def collate(batches: Sequence[FrameBatch]) -> FrameBatch:
@@ -387,3 +408,19 @@ class _Shuffled(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         return iter(np.random.default_rng((self.seed, self.epoch)).permutation(self.count).tolist())
+
+
+class _Halves(_Shuffled):
+    """An epoch goes once through the first `frames` rows, in batches filled up from the `colons` rows behind them."""
+
+    def __init__(self, frames: int, colons: int, batch_size: int, seed: int) -> None:
+        self.frames, self.colons, self.second = frames, colons, batch_size // 2
+        self.first = batch_size - self.second
+        self.batches = max(1, frames // self.first)
+        super().__init__(self.batches * batch_size, seed)
+
+    def __iter__(self) -> Iterator[int]:
+        rng = np.random.default_rng((self.seed, self.epoch))
+        frames = np.resize(rng.permutation(self.frames), (self.batches, self.first))
+        colons = self.frames + np.resize(rng.permutation(self.colons), (self.batches, self.second))
+        return iter(np.concatenate([frames, colons], 1).ravel().tolist())

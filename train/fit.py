@@ -9,13 +9,10 @@ the run is complete.
 
 from __future__ import annotations
 
-import json
-import logging
 import math
 import shutil
 import sys
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -43,6 +40,7 @@ from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit
 
 from .callbacks import Diagnosis, DiagnosisConfig, Panels, Progress, validation_line
 from .datamodule import FrameDataModule
+from .running import card_text, quiet, report_every
 
 _OURS = (
     *("config.yaml", "log.txt", "tensorboard", "checkpoints", "model.safetensors", "model.md", "uncertainty.png"),
@@ -115,7 +113,7 @@ def fit(
         )
     check_output(output, resume, overwrite)
     started = time.time()
-    _quiet()
+    quiet()
     checkpoints = output / "checkpoints"
     last = checkpoints / "last.ckpt"
     resumed = last if resume and last.exists() else None
@@ -211,32 +209,6 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def card_text(card: dict[str, Any], name: str) -> str:
-    """The card as a page to read."""
-    errors = card["errors"]
-    lines = [f"# {name}", "", card["trained_on"], ""]
-    lines += [f"- {key}: {card[key]}" for key in ("steps", "seed", "checkpoint", "rows", "version") if key in card]
-    lines += [f"- network: `{json.dumps(card['network'])}`", f"- loss: `{json.dumps(card['loss'])}`", ""]
-    if "abs_rel_median" in errors:
-        lines += ["On the validation frames, depth median-aligned per frame:", ""]
-        lines += ["| | AbsRel | RMSE mm | MedAE mm | share within 1.25 |", "|---|---|---|---|---|"]
-        for prefix, who in (("", "network"), ("closed_form/", "closed form")):
-            values = [errors[f"{prefix}{key}_median"] for key in ("abs_rel", "rmse_mm", "medae_mm", "delta1")]
-            lines.append(f"| {who} | " + " | ".join(f"{value:.3f}" for value in values) + " |")
-    else:
-        lines.append(f"Validation loss (no truth): {errors.get('loss', math.nan):.4f}")
-    doubt = card.get("uncertainty")
-    if doubt:
-        mean, rms = (doubt["sparsification"][name] for name in ("mean", "rms"))
-        shares = ", ".join(f"{level}: {share:.1%}" for level, share in doubt["coverage"].items())
-        lines += [
-            "",
-            f"Uncertainty, calibrated on those frames: sparsification error {mean:.2f} (mean error), {rms:.2f} (RMS) "
-            f"of a random order's; share of pixels inside the intervals of {shares}.",
-        ]
-    return "\n".join(lines) + "\n"
-
-
 class _SaveLast(pl.Callback):
     """The last checkpoint of a run that ends well, before averaging puts the average in the place of the weights."""
 
@@ -275,7 +247,7 @@ def _with_callbacks(
         ),
         Panels(),
         Diagnosis(settings.diagnosis, data.names),
-        Progress(echo, every=_report_every(steps)),
+        Progress(echo, every=report_every(steps)),
         _SaveLast(output / "checkpoints" / "last.ckpt"),
     ]
     if settings.ema > 0:
@@ -292,10 +264,6 @@ def _with_callbacks(
     options["callbacks"] = [*(callbacks if isinstance(callbacks, list) else [callbacks]), *extra]
     options.setdefault("default_root_dir", str(output))
     return options
-
-
-def _report_every(steps: int) -> int:
-    return 50 if steps <= 0 else max(1, min(100, steps // 10))
 
 
 def _card(
@@ -358,17 +326,3 @@ class _Echo:
         print(line, file=sys.stderr, flush=True)
         with self.log.open("a") as file:
             file.write(line + "\n")
-
-
-def _quiet() -> None:
-    """Lightning's tips and hardware lists do not belong in a log; its warnings that matter stay."""
-    for name in ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero"):
-        logging.getLogger(name).setLevel(logging.ERROR)
-    warnings.filterwarnings("ignore", ".*does not have many workers.*")
-    warnings.filterwarnings("ignore", ".*number of training batches.*")
-    warnings.filterwarnings("ignore", ".*exists and is not empty.*")
-    warnings.filterwarnings("ignore", ".*isn't supported for scheduler.*")
-    warnings.filterwarnings("ignore", ".*dirpath has changed.*")
-    warnings.filterwarnings("ignore", ".*LeafSpec.*")
-    warnings.filterwarnings("ignore", ".*mid-epoch.*|.*ended.*epoch.*")
-    torch.set_float32_matmul_precision("high")
