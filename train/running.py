@@ -52,4 +52,5 @@ def quiet() -> None:
     warnings.filterwarnings("ignore", ".*dirpath has changed.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")
     warnings.filterwarnings("ignore", ".*mid-epoch.*|.*ended.*epoch.*")
+    warnings.filterwarnings("ignore", ".*in eval mode at the start of training.*")  # what is frozen is so on purpose
     torch.set_float32_matmul_precision("high")

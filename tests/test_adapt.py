@@ -1,0 +1,300 @@
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from colons import colon, slam
+
+from lightdepth.checkpoint import load_model, read_card, save_model
+from lightdepth.datasets import write_folder
+from lightdepth.errors import InputError, PartialFailure
+from lightdepth.frame import to_batch
+from lightdepth.losses import LossConfig
+from lightdepth.maps import write_multimap
+from lightdepth.network import NetworkConfig, build_network
+from lightdepth.photometry import PhotometricCalibration
+from lightdepth.predict import NetworkModel
+from train.adapt import Judgement, Verdict, adapt, verdict
+from train.adaptation import Adaptation, anchor_loss, let_learn, merge, source_colons, target_loss
+from train.datamodule import FrameDataModule, TubeData, collate
+
+SIZE = (40, 32)
+
+
+def network(norm: str = "group", seed: int = 0):
+    torch.manual_seed(seed)
+    made = build_network(NetworkConfig(width=4, norm=norm))
+    with torch.no_grad():
+        made.body.head.weight.normal_(std=0.05)  # not the closed form itself
+    return made
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory) -> Path:
+    """A checkpoint that has learned nothing."""
+    path = tmp_path_factory.mktemp("start") / "start.safetensors"
+    tube = {"scenes": 9, "val_scenes": 2, "frames": 2, "lenses": ["pinhole"], "mu": [0.0, 0.5], "family": "plain"}
+    card = {"trained_on": "nothing.", "rows": 32, "loss": asdict(LossConfig(reflectance=None)), "tube": tube}
+    save_model(network(), path, card)
+    return path
+
+
+@pytest.fixture(scope="module")
+def sequences(tmp_path_factory) -> Path:
+    """`plain` without truth, `truth` with it, `unlit` without a light of its own and a map of it in `slam`."""
+    root = tmp_path_factory.mktemp("sequences")
+    frames = colon(count=10).frames
+    bare = [replace(f, true_distance=None, true_world_from_cam=None) for f in frames]
+    write_folder(bare, root / "plain")
+    write_folder(frames, root / "truth")
+    write_folder(bare, root / "unlit")
+    (root / "unlit" / "light.json").unlink()
+    write_multimap(slam(frames).map, root / "slam")
+    return root
+
+
+def adapted(start: Path, data: Path, run: Path, **options) -> dict:
+    """The record of a run of a few steps."""
+    adapt(data, run, str(start), **{"steps": 6, "batch_size": 2, "size": SIZE, "learning_rate": 3e-3, **options})
+    return json.loads((run / "run.json").read_text())
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    model = load_model(path)
+    assert isinstance(model, NetworkModel)
+    return {name: value.cpu() for name, value in model.network.state_dict().items()}
+
+
+def test_unlabelled_frames_lower_the_loss_on_frames_that_were_never_trained_on(start, sequences, tmp_path):
+    record = adapted(start, sequences / "plain", tmp_path / "run", steps=16)
+    assert record["criterion"] == "label_free" and record["better"] and record["written"]
+    assert record["after"]["loss"] < 0.95 * record["before"]["loss"]
+    assert record["frames"] == {"train": 8, "val": 2} and "abs_rel_median" not in record["before"]
+    assert {p.name for p in (tmp_path / "run").iterdir()} == {
+        *("config.yaml", "log.txt", "light.json", "model.safetensors", "model.md", "report.html", "run.json")
+    }
+    card = read_card(tmp_path / "run" / "model.safetensors")
+    assert card["adapted_from"] == "start" and card["rows"] == SIZE[1]
+    assert "can fall while distance gets worse" in (tmp_path / "run" / "report.html").read_text()
+    assert load_model(tmp_path / "run" / "model.safetensors")(colon(count=10).frames[0]).distance.shape == (80, 96)
+
+
+def test_a_network_that_got_worse_is_not_written_unless_asked_for(start, sequences, tmp_path, monkeypatch):
+    original = Adaptation.batch_loss
+
+    def astray(self, batch):
+        total, *rest = original(self, batch)
+        return (-total, *rest)
+
+    monkeypatch.setattr(Adaptation, "batch_loss", astray)
+    run = tmp_path / "run"
+    with pytest.raises(PartialFailure, match=r"model\.safetensors: not written, the adapted network got worse"):
+        adapted(start, sequences / "truth", run)
+    record = json.loads((run / "run.json").read_text())
+    assert record["criterion"] == "truth" and not record["better"] and not record["written"]
+    assert not list(run.glob("model*")) and "--keep-worse" in (run / "report.html").read_text()
+    kept = adapted(start, sequences / "truth", run, keep_worse=True, overwrite=True)
+    assert not kept["better"] and kept["written"] and (run / "model.safetensors").is_file()
+
+
+def test_truth_judges_before_the_map_and_the_map_before_the_loss():
+    def judgement(abs_rel, at_points, loss):
+        return Judgement({"loss": loss, **({} if abs_rel is None else {"abs_rel_median": abs_rel})}, at_points)
+
+    assert verdict(judgement(0.1, 0.2, 3.0), judgement(0.2, 0.1, 2.0)) == Verdict("truth", 0.1, 0.2)
+    assert verdict(judgement(None, 0.2, 3.0), judgement(None, 0.3, 2.0)) == Verdict("map", 0.2, 0.3)
+    assert verdict(judgement(None, None, 3.0), judgement(None, None, 2.0)).better
+    assert not Verdict("map", 0.2, float("nan")).better and not Verdict("truth", 0.1, 0.2).better
+
+
+def test_a_map_finds_the_light_that_nobody_gave_and_its_points_judge(start, sequences, tmp_path):
+    record = adapted(start, sequences / "unlit", tmp_path / "run", map=sequences / "slam", keep_worse=True, steps=2)
+    assert record["criterion"] == "map" and 0 < record["before"]["map"] < 1 and 0 < record["after"]["map"] < 1
+    assert record["light_fit"]["used"] == (record["light"] != asdict_json(PhotometricCalibration()))
+    written = json.loads((tmp_path / "run" / "light.json").read_text())
+    assert written["gamma"] == pytest.approx(record["light"]["gamma"])
+    given = adapted(
+        start,
+        sequences / "unlit",
+        tmp_path / "given",
+        light="gamma=2,mu=1",
+        map=sequences / "slam",
+        keep_worse=True,
+        steps=1,
+    )
+    assert "light_fit" not in given and given["light"]["mu"] == 1
+
+
+def asdict_json(value) -> dict:
+    return json.loads(json.dumps(asdict(value)))
+
+
+def test_the_light_that_the_map_told_is_what_training_sees(start, sequences, tmp_path, monkeypatch):
+    seen = []
+    original = Adaptation.batch_loss
+
+    def spy(self, batch):
+        seen.append(batch.light.gamma.flatten().tolist())
+        return original(self, batch)
+
+    found = PhotometricCalibration(gamma=1.3, mu=0.7, source="measured")
+    monkeypatch.setattr("train.adapt._fitted_light", lambda *_: found)
+    monkeypatch.setattr(Adaptation, "batch_loss", spy)
+    adapted(start, sequences / "unlit", tmp_path / "run", map=sequences / "slam", keep_worse=True, steps=2)
+    assert len(seen) == 2 and np.allclose(seen, 1.3)
+
+
+def trained(network_, what: str, steps: int = 3, rank: int = 4, **options) -> Adaptation:
+    """A few steps on two frames of a colon, without Lightning."""
+    model = NetworkModel(network_, SIZE[1], "start")
+    module = Adaptation(model, LossConfig(reflectance=0.0), 1e-2, SIZE[1], what=what, rank=rank, **options)
+    batch = collate([to_batch(frame, SIZE) for frame in colon(count=10).frames[:2]])
+    optimizer = torch.optim.AdamW([p for p in module.network.parameters() if p.requires_grad], lr=1e-2)
+    module.train()
+    for _ in range(steps):
+        optimizer.zero_grad()
+        module.batch_loss(batch)[0].backward()
+        optimizer.step()
+    return module.eval()
+
+
+@pytest.mark.parametrize("norm", ["group", "batch"])
+@pytest.mark.parametrize(
+    ("what", "learns"),
+    [
+        ("decoder", lambda name: name.startswith(("body.decoder", "body.head"))),
+        ("norms", lambda name: "norm" in name or name.startswith("body.stem.1")),
+        (
+            "low_rank",
+            lambda name: name.endswith("weight") and "norm" not in name and not name.startswith("body.stem.1"),
+        ),
+    ],
+)
+def test_what_does_not_learn_stays_equal_to_the_bit(what, learns, norm):
+    before = {name: value.clone() for name, value in network(norm).state_dict().items()}
+    module = trained(network(norm), what)
+    merge(module.network)
+    after = module.network.state_dict()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed and all(learns(name) for name in changed)
+    assert {n.split(".")[1] for n in changed} >= ({"decoder"} if what == "decoder" else {"encoder", "decoder"})
+
+
+def test_low_rank_additions_end_as_plain_weights_that_compute_the_same():
+    before = {name: value.clone() for name, value in network().state_dict().items()}
+    module = trained(network(), "low_rank", rank=2, generator=torch.Generator().manual_seed(0))
+    batch = to_batch(colon(count=10).frames[0], SIZE)
+    apart, _ = module(batch)
+    merge(module.network)
+    assert module.network.state_dict().keys() == before.keys()
+    assert torch.allclose(module(batch)[0], apart, rtol=1e-5)
+    name = "body.encoder.1.conv1.weight"
+    added = (module.network.state_dict()[name] - before[name]).flatten(1)
+    assert torch.linalg.matrix_rank(added, rtol=1e-4) == 2
+
+
+def test_an_exported_low_rank_model_is_a_plain_checkpoint(start, sequences, tmp_path):
+    adapted(start, sequences / "plain", tmp_path / "run", what="low_rank", rank=1, steps=2, keep_worse=True)
+    before, after = weights(start), weights(tmp_path / "run" / "model.safetensors")
+    assert before.keys() == after.keys()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert "body.encoder.0.conv1.weight" in changed and not any("norm" in name for name in changed)
+
+
+def test_only_what_is_named_counts_as_learning():
+    assert let_learn(network(), "norms") < let_learn(network(), "decoder") < let_learn(network(), "all")
+    with pytest.raises(InputError, match="rank of at least 1"):
+        let_learn(network(), "low_rank", 0)
+
+
+def test_the_anchor_holds_shape_and_not_scale():
+    before = torch.rand(2, 1, 6, 8) + 0.5
+    mask = torch.ones_like(before, dtype=torch.bool)
+    assert anchor_loss(before * torch.tensor([2.0, 0.3]).reshape(2, 1, 1, 1), before, mask) < 1e-6
+    bent = before.clone()
+    bent[:, :, :, :2] *= 1.5  # a quarter of the pixels, so that the median is that of the others
+    assert anchor_loss(bent, before, mask) == pytest.approx(np.log(1.5) / 4, rel=1e-5)
+    assert anchor_loss(bent, before, bent == before) < 1e-6
+
+
+def test_an_anchored_network_stays_nearer_to_its_start():
+    batch = to_batch(colon(count=10).frames[0], SIZE)
+    first = network().eval()(batch.image, batch.mask, batch.rays, batch.light)[0].detach()
+
+    def moved(anchor):
+        last = trained(network(), "all", 12, anchor=anchor)(batch)[0].detach()
+        return float(anchor_loss(last, first, batch.mask))
+
+    assert moved(20.0) < 0.5 * moved(0.0)
+
+
+def test_replay_fills_the_second_half_of_every_batch_with_colons_of_the_source(sequences):
+    tube = TubeData(scenes=1, frames=3, lenses=("pinhole",))
+    data = FrameDataModule([str(sequences / "plain")], tube=tube, halves=True, size=SIZE, batch_size=3, held_out=0.2)
+    data.setup()
+    for epoch in range(2):
+        names = [data.names(epoch, i) for i in range(len(data.train_dataloader()))]
+        assert len(names) == 4 and all(["colon" in n for n in batch] == [False, False, True] for batch in names)
+        assert len({n for batch in names for n in batch[:2]}) == 8  # every frame once
+    batches = list(data.train_dataloader())
+    assert all(b.true_valid.flatten(1).any(1).tolist() == [False, False, True] for b in batches)
+    with pytest.raises(InputError, match="batch_size of at least 2"):
+        FrameDataModule(halves=True, batch_size=1)
+
+
+@pytest.mark.parametrize("replay", [False, True])
+def test_the_target_s_truth_is_never_looked_at_and_the_replayed_colons_is(replay):
+    loss = LossConfig(reflectance=0.0, supervised=1.0)
+    module = Adaptation(NetworkModel(network(), SIZE[1], "start"), loss, 1e-3, SIZE[1], replay=replay)
+    batch = collate([to_batch(frame, SIZE) for frame in colon(count=10).frames[:2]])
+
+    def with_truth_of(row):
+        bent = batch.true_distance.clone()
+        bent[row, :, :, ::2] *= 1.5
+        return float(module.batch_loss(batch._replace(true_distance=bent))[0].detach())
+
+    plain = float(module.batch_loss(batch)[0].detach())
+    assert with_truth_of(0) == plain
+    assert (with_truth_of(1) != plain) == replay
+
+
+def test_a_run_with_replay_and_anchor_uses_colons_of_the_start_s_kind(start, sequences, tmp_path):
+    record = adapted(start, sequences / "plain", tmp_path / "run", replay=1, anchor=0.5, keep_worse=True, steps=3)
+    assert record["frames"]["train"] == 8 + 2
+    assert read_card(tmp_path / "run" / "model.safetensors")["replayed"]["lenses"] == ["pinhole"]
+    assert source_colons(read_card(start), 3) == TubeData(3, frames=2, lenses=("pinhole",), mu=(0.0, 0.5))
+
+
+def test_the_loss_is_the_card_s_made_fit_for_frames_without_truth():
+    card = {
+        "loss": asdict(LossConfig(gain="one", supervised=1.0, self_supervised=0.0, photometric=0.0, smoothness=7.0))
+    }
+    loss = target_loss(card, True, False)
+    assert (loss.gain, loss.supervised, loss.self_supervised, loss.photometric) == ("free", 0.0, 1.0, 1.0)
+    assert loss.smoothness == 7.0 and target_loss(card, True, True).supervised == 1.0
+    calibrated = {"loss": asdict(LossConfig(reflectance=None))}
+    assert target_loss(calibrated, True, False).reflectance is None
+    assert target_loss(calibrated, False, False).reflectance == LossConfig().reflectance
+    assert target_loss({}, True, False) == LossConfig()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"checkpoint": "decline"}, "has no weights to adapt"),
+        ({"steps": 0}, "expected positive numbers"),
+        ({"anchor": -1.0}, "anchor -1.0"),
+        ({"held_out": 1.0}, "a share above 0 and below 1"),
+        ({"replay": 1, "batch_size": 1}, "batch_size of at least 2"),
+        ({"data": Path("nowhere")}, "nowhere"),
+        ({"map": Path("nowhere")}, "nowhere"),
+        ({"more": (Path("nowhere"),)}, "nowhere"),
+    ],
+)
+def test_what_cannot_be_used_is_said_and_nothing_is_left_behind(start, sequences, tmp_path, options, said):
+    arguments = {"data": sequences / "plain", "checkpoint": str(start), "size": SIZE, **options}
+    with pytest.raises(InputError, match=said):
+        adapt(output=tmp_path / "run", **arguments)
+    assert not list(tmp_path.iterdir())
