@@ -46,19 +46,19 @@ _NAMES = {
     "map": "median error at the map's points",
     "label_free": "held-out self-supervised loss",
 }
+_KEYS = {"truth": "abs_rel_median", "label_free": "loss"}
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """How good a model is on held-out frames: `errors` as validation gives them, `map` None without a usable map."""
+    """How good a model is on held-out frames: `errors` as validation gives them, and at the points of a usable map."""
 
     errors: dict[str, float]
-    map: float | None
+    at_points: float | None
 
     def by(self, criterion: str) -> float | None:
-        return {"truth": self.errors.get("abs_rel_median"), "map": self.map, "label_free": self.errors["loss"]}[
-            criterion
-        ]
+        """The criterion's value, or None where it cannot be had."""
+        return self.at_points if criterion == "map" else self.errors.get(_KEYS[criterion])
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Verdict:
 
 def verdict(before: Judgement, after: Judgement) -> Verdict:
     """By truth where there is any, else by the map's points, else by the loss."""
-    for criterion in ("truth", "map", "label_free"):
+    for criterion in _NAMES:
         first, second = before.by(criterion), after.by(criterion)
         if first is not None:
             return Verdict(criterion, first, math.nan if second is None else second)
@@ -214,7 +214,7 @@ def adapt(
             )
             save_model(module.network, run.folder / "model.safetensors", card)
             (run.folder / "model.md").write_text(card_text(card, output.name))
-        page = _page(data, start, module, run, (before, after), closed, found, written, counts["val"])
+        page = _page(data, start, module, run, frames[0].light, (before, after), closed, found, written, counts["val"])
         page.wide_figures([_picture(frame, row) for frame, row in zip(shown, pictures, strict=True)])
         page.write(run.folder / "report.html")
         run.record.update(
@@ -225,8 +225,8 @@ def adapt(
                 "loss": asdict(loss),
                 "learning_weights": module.learning,
                 "criterion": found.criterion,
-                "before": {"map": before.map, **before.errors},
-                "after": {"map": after.map, **after.errors},
+                "before": {"map": before.at_points, **before.errors},
+                "after": {"map": after.at_points, **after.errors},
                 "closed_form_map": closed,
                 "better": found.better,
                 "written": written,
@@ -301,7 +301,12 @@ _TRAINER: dict[str, Any] = {
 
 def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> None:
     callbacks = [Diagnosis(DiagnosisConfig(), data.names), Progress(run.log, report_every(steps))]
-    options = {"max_steps": steps, "gradient_clip_val": 1.0, "limit_val_batches": 0, "log_every_n_steps": 1}
+    options: dict[str, Any] = {
+        "max_steps": steps,
+        "gradient_clip_val": 1.0,
+        "limit_val_batches": 0,
+        "log_every_n_steps": 1,
+    }
     pl.Trainer(**_TRAINER, **options, callbacks=callbacks).fit(module, datamodule=data)
 
 
@@ -338,6 +343,7 @@ def _page(
     start: NetworkModel,
     module: Adaptation,
     run: Run,
+    seen: PhotometricCalibration,
     judged: tuple[Judgement, Judgement],
     closed_map: float | None,
     found: Verdict,
@@ -353,9 +359,10 @@ def _page(
             "how right the distance is. It can fall while distance gets worse; a sparse map (--map) tells."
         )
     light = run.record.get("light_fit")
-    page.text(f"Light fitted on the map: {light['summary']}." if light else "The light was taken as given or assumed.")
+    page.text(f"Light of the frames: {_said(seen)}." + (f" The map's: {light['summary']}." if light else ""))
     page.heading(f"Before and after, on {held} frames that were held out")
-    headers, columns = ["model"], []
+    headers = ["model"]
+    columns: list[list[float | None]] = []
     before, after = judged
     if "abs_rel_median" in before.errors:
         titles = {"abs_rel": "AbsRel", "rmse_mm": "RMSE mm", "medae_mm": "MedAE mm", "delta1": "share within 1.25"}
@@ -363,9 +370,9 @@ def _page(
             headers.append(f"{title} (median-aligned)")
             keys = (f"closed_form/{name}_median", f"{name}_median", f"{name}_median")
             columns.append([e.errors[key] for e, key in zip((before, before, after), keys, strict=True)])
-    if before.map is not None:
+    if before.at_points is not None:
         headers.append("median error at the map's points")
-        columns.append([closed_map, before.map, after.map])
+        columns.append([closed_map, before.at_points, after.at_points])
     for name, title in (("loss", "self-supervised loss"), ("inconsistency", "inconsistency")):
         headers.append(title)
         columns.append([None, before.errors[name], after.errors[name]])
