@@ -114,7 +114,7 @@ def target_loss(card: dict[str, Any], reflectance_known: bool, replayed: bool) -
 def source_colons(card: dict[str, Any], scenes: int) -> TubeData:
     """So many colons of the kind that a checkpoint's card says it was trained on; of the default kind without one."""
     own = card.get("tube") or {}
-    known = {
+    known: dict[str, Any] = {
         name: tuple(own[name]) if isinstance(own[name], list) else own[name]
         for name in ("frames", "travel", "lenses", "mu", "gamma", "reflectance", "family")
         if name in own
