@@ -2,7 +2,7 @@
 
 Source: pinhole, mu 0-.5, gamma 2.4-2.6, reflectance 0-.2, plain colons. Target: fisheye, mu 3-3.5, gamma 1.8-2.0,
 reflectance .5-.7, realistic colons. All 80x64. Start: self-supervised on 240 source frames. At home: self-supervised
-on 480 target frames of other colons, from nothing (not thousands: this is to end within the hour). Adapted: on 200 target
+on 480 target frames of other colons, from nothing (not thousands: that took too long). Adapted: on 200 target
 frames of 25 colons, by `lightdepth adapt`. Judged on 48 frames of 12 target colons that nobody saw, and on as many of
 the source. Every colon's light is known, as of a calibrated endoscope. LIGHTDEPTH_BENCH names a folder to keep what was
 made in.
