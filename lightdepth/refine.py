@@ -6,10 +6,8 @@ are 2^k times as coarse as the image. What is sought is
     log t = log start + sum_k upsampled(p_k)
 
 with the least self-supervised loss (lightdepth.losses): a coarse grid moves whole walls at once, which pixels alone
-would take thousands of steps for. The light from the wall changes slowly, and is renewed every few steps.
-
-Measured on synthetic colons: it helps the closed form where walls light each other little, does nothing for it where
-they do so strongly, and pulls a good network to the loss's own optimum, which is worse; `anchor` holds it back.
+would take thousands of steps for. Every grid moves by up to the learning rate at every step, so it has to be small. A
+start far from the loss's own optimum gains, and one that is better than it would be pulled there: `anchor` holds it.
 """
 
 from __future__ import annotations
