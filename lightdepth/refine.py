@@ -21,10 +21,13 @@ from torch import Tensor
 
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, FrameBatch, to_batch
-from lightdepth.losses import LossConfig, self_supervised_loss
+from lightdepth.losses import LossConfig, Seen, indirect_light, self_supervised_loss
 from lightdepth.losses.masked import masked_mean
 from lightdepth.predict import DepthModel, extended, prediction_of, upsampled, working_size
 from lightdepth.prediction import DepthPrediction
+
+_RENEWED = 10
+"""Steps for which the light from wall to wall is kept: it changes slowly, and costs as much as all else."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,8 @@ def refine(log_start: Tensor, batch: FrameBatch, config: RefineConfig) -> Tensor
         log_start.new_zeros(len(log_start), 1, -(-height // 2**k), -(-width // 2**k)).requires_grad_()
         for k in range(config.levels)
     ]
-    albedo = log_start.new_full((len(log_start), 2, height, width), 0.5)  # its colour has no part in distance
+    seen = Seen.of(batch, config.loss)
+    indirect = None
 
     def current() -> Tensor:
         finest, *coarser = grids
@@ -74,9 +78,12 @@ def refine(log_start: Tensor, batch: FrameBatch, config: RefineConfig) -> Tensor
     with torch.inference_mode(False), torch.enable_grad():
         optimizer = torch.optim.Adam(grids, lr=config.learning_rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(config.steps, 1))
-        for _ in range(config.steps):
+        for step in range(config.steps):
             log_t = current()
-            total = self_supervised_loss(log_t.exp(), albedo, batch, config.loss)[0]
+            distance = log_t.exp()
+            if step % _RENEWED == 0:
+                indirect = indirect_light(distance, batch.rays, batch.mask, batch.light, config.loss)
+            total = self_supervised_loss(distance, None, batch, config.loss, seen, indirect)[0]
             if config.anchor > 0:
                 total = total + config.anchor * masked_mean((log_t - log_start).abs(), batch.mask)
             if not torch.isfinite(total):

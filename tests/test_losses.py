@@ -13,6 +13,7 @@ from lightdepth.losses import (
     brightness_residual,
     chroma_loss,
     facing_loss,
+    indirect_light,
     log_error,
     masked_mean,
     masked_median,
@@ -23,6 +24,7 @@ from lightdepth.losses import (
     rgb_residual,
     saturated_loss,
     self_supervised_loss,
+    smoothness_guide,
     smoothness_loss,
     specular_loss,
     ssim_loss,
@@ -54,7 +56,8 @@ def tube_batch(height: int = 32, width: int = 40, gain: float = 1.0, config: Los
     light = LightTerms(*(t.expand(batch, *t.shape[1:]) for t in PhotometricCalibration().terms()))
     mask = torch.ones(batch, 1, height, width, dtype=torch.bool)
     colour = torch.tensor([0.55, 0.4]).reshape(1, 2, 1, 1).expand(batch, 2, height, width)
-    log_v = rendered_log_brightness(distance, normals_from_distance(distance, rays), rays, mask, light, config)
+    indirect = indirect_light(distance, rays, mask, light, config)
+    log_v = rendered_log_brightness(distance, normals_from_distance(distance, rays), rays, light, indirect, config)
     image = log_v.exp() * encode(hue_saturation_albedo(colour), light.gamma) * gain ** (1 / 2.2)
     return FrameBatch(image.clamp(0, 1), mask, rays, light, distance, mask), colour
 
@@ -124,7 +127,7 @@ def test_smoothness_is_zero_for_log_linear_distance_and_forgives_bends_at_edges(
     ramp = torch.linspace(0, 1, 24).expand(1, 1, 20, 24)
     step = (torch.arange(24) >= 12).float().expand(1, 1, 20, 24)
     assert smoothness_loss(ramp, flat, mask) < 1e-6
-    assert smoothness_loss(step, step * 3, mask) < smoothness_loss(step, flat, mask) * 0.5
+    assert smoothness_loss(step, smoothness_guide(step * 3, mask), mask) < smoothness_loss(step, flat, mask) * 0.5
 
 
 def test_smoothness_of_a_surface_hardly_depends_on_the_resolution():
@@ -210,7 +213,8 @@ def test_gradient_of_the_direct_model_agrees_with_differences():
     def residual(log_distance):
         distance = log_distance.exp()
         normals = normals_from_distance(distance, double.rays)
-        return rendered_log_brightness(distance, normals, double.rays, double.mask, double.light, LAMBERT)
+        indirect = indirect_light(distance, double.rays, double.mask, double.light, LAMBERT)
+        return rendered_log_brightness(distance, normals, double.rays, double.light, indirect, LAMBERT)
 
     log_distance = double.true_distance.log() + 0.05 * torch.sin(torch.arange(20).reshape(1, 1, 4, 5))
     assert torch.autograd.gradcheck(residual, log_distance.double().requires_grad_())

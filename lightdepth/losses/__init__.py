@@ -10,6 +10,7 @@ from lightdepth.losses.config import LossConfig
 from lightdepth.losses.light import (
     brightness_residual,
     chroma_loss,
+    indirect_light,
     photometric_loss,
     rendered_log_brightness,
     rendered_rgb,
@@ -19,16 +20,18 @@ from lightdepth.losses.light import (
     ssim_loss,
 )
 from lightdepth.losses.masked import masked_mean, masked_median
-from lightdepth.losses.surface import albedo_loss, facing_loss, smoothness_loss
-from lightdepth.losses.total import render_image, self_supervised_loss, training_loss
+from lightdepth.losses.surface import albedo_loss, facing_loss, smoothness_guide, smoothness_loss
+from lightdepth.losses.total import Seen, render_image, self_supervised_loss, training_loss
 from lightdepth.losses.truth import log_error, supervised_loss, uncertainty_loss
 
 __all__ = [
     "LossConfig",
+    "Seen",
     "albedo_loss",
     "brightness_residual",
     "chroma_loss",
     "facing_loss",
+    "indirect_light",
     "log_error",
     "masked_mean",
     "masked_median",
@@ -39,6 +42,7 @@ __all__ = [
     "rgb_residual",
     "saturated_loss",
     "self_supervised_loss",
+    "smoothness_guide",
     "smoothness_loss",
     "specular_loss",
     "ssim_loss",

@@ -24,17 +24,21 @@ _CHROMA_V = 0.1
 _SSIM_WINDOW = 5
 
 
+def indirect_light(distance: Tensor, rays: Tensor, mask: Tensor, light: LightTerms, config: LossConfig) -> Tensor:
+    """E (B, 1, H, W) under the configuration's reflectance, or each image's own. No gradient flows through it."""
+    if config.reflectance is not None:
+        light = light._replace(reflectance=torch.full_like(light.reflectance, config.reflectance))
+    if not bool((light.reflectance > 0).any()):
+        return torch.zeros_like(distance)
+    return indirect_irradiance(distance.detach(), rays, mask, light.co_located(), config.bounces, config.pool)
+
+
 def rendered_log_brightness(
-    distance: Tensor, normals: Tensor, rays: Tensor, mask: Tensor, light: LightTerms, config: LossConfig
+    distance: Tensor, normals: Tensor, rays: Tensor, light: LightTerms, indirect: Tensor, config: LossConfig
 ) -> Tensor:
     """log(fall · max(cos, floor)^q / t² + E) / gamma, the log brightness of a wall of value 1. (B, 1, H, W)"""
     light = light.co_located()
     direct = irradiance(distance, normals, rays, light, config.cosine_exponent, config.cosine_floor)
-    if config.reflectance is not None:
-        light = light._replace(reflectance=torch.full_like(light.reflectance, config.reflectance))
-    indirect: Tensor | float = 0.0
-    if bool((light.reflectance > 0).any()):
-        indirect = indirect_irradiance(distance.detach(), rays, mask, light, config.bounces, config.pool)
     return (direct + indirect).clamp(min=1e-12).log() / light.gamma
 
 

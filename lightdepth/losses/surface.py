@@ -18,14 +18,18 @@ def facing_loss(normals: Tensor, rays: Tensor, mask: Tensor, floor: float) -> Te
     return masked_mean((floor + (normals * rays).sum(1, keepdim=True)).clamp(min=0), mask)
 
 
-def smoothness_loss(log_distance: Tensor, log_seen: Tensor, mask: Tensor) -> Tensor:
-    """Mean over both axes of |second difference of log t| · exp(-5 |difference of blurred log V|).
+def smoothness_guide(log_seen: Tensor, mask: Tensor) -> Tensor:
+    """Blurred log V, whose edges may be edges of the distance. (B, 1, H, W)"""
+    return masked_blur(log_seen, mask, log_seen.shape[-2] * 0.009)
+
+
+def smoothness_loss(log_distance: Tensor, guide: Tensor, mask: Tensor) -> Tensor:
+    """Mean over both axes of |second difference of log t| · exp(-5 |difference of the guide|).
 
     Differences are rescaled to an image of 112 rows, so that a weight holds at every resolution: a first difference
     shrinks with the pixel's size, a second difference with its square.
     """
     rows = log_distance.shape[-2] / ROWS
-    guide = masked_blur(log_seen, mask, log_seen.shape[-2] * 0.009)
     total = log_distance.new_zeros(())
     for axis in (-1, -2):
         length = log_distance.shape[axis]

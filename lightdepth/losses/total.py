@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from torch import Tensor
 
 from lightdepth.decline import informative
+from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.losses import light as lit
@@ -16,38 +19,68 @@ from lightdepth.photometry import brightness
 _V_FLOOR = 1e-2
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What the loss takes from the images alone, (B, 1, H, W) each: log V, which pixels are white, which tell of
+    distance, and the guide of the smoothness. A loss that is taken many times on the same images needs it once."""
+
+    log_v: Tensor
+    saturated: Tensor
+    usable: Tensor
+    guide: Tensor
+
+    @classmethod
+    def of(cls, batch: FrameBatch, config: LossConfig) -> Seen:
+        v = brightness(batch.image)
+        log_v = v.clamp(min=_V_FLOOR).log()
+        saturated = batch.mask & (v >= config.white)
+        usable = informative(batch.image, batch.mask) & ~saturated
+        return cls(log_v, saturated, usable, surface.smoothness_guide(log_v, batch.mask))
+
+
 def self_supervised_loss(
-    distance: Tensor, albedo_hs: Tensor, batch: FrameBatch, config: LossConfig
+    distance: Tensor,
+    albedo_hs: Tensor | None,
+    batch: FrameBatch,
+    config: LossConfig,
+    seen: Seen | None = None,
+    indirect: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The weighted sum of all terms that need no truth, and the terms unweighted; those without weight are left out,
-    but for the five of the default."""
+    but for the five of the default.
+
+    `seen` and `indirect` are made from the images and the distance where they are not given. Without an albedo there
+    is no chroma, and nothing but brightness can be compared.
+    """
     image, mask, rays, light = batch.image, batch.mask, batch.rays, batch.light
-    v = brightness(image)
-    log_seen = v.clamp(min=_V_FLOOR).log()
-    saturated = mask & (v >= config.white)
-    usable = informative(image, mask) & ~saturated
+    seen = seen or Seen.of(batch, config)
+    if indirect is None:
+        indirect = lit.indirect_light(distance, rays, mask, light, config)
 
     normals = normals_from_distance(distance, rays)
-    log_rendered = lit.rendered_log_brightness(distance, normals, rays, mask, light, config)
+    log_rendered = lit.rendered_log_brightness(distance, normals, rays, light, indirect, config)
     free = config.gain == "free"
-    residual = lit.brightness_residual(log_seen, log_rendered, usable) if free else log_seen - log_rendered
+    residual = lit.brightness_residual(seen.log_v, log_rendered, seen.usable) if free else seen.log_v - log_rendered
     compared, rendered = residual, image
     if config.space != "log" or config.ssim > 0:
-        rendered = lit.rendered_rgb(log_seen - residual, albedo_hs, light.gamma)
+        if albedo_hs is None:
+            raise InputError(f"loss space {config.space!r}, ssim {config.ssim}: no colours without albedo")
+        rendered = lit.rendered_rgb(seen.log_v - residual, albedo_hs, light.gamma)
     if config.space != "log":
         compared = lit.rgb_residual(image, rendered, light.gamma, config.space)
     terms = {
-        "photometric": lit.photometric_loss(compared, usable, config.huber),
-        "saturated": lit.saturated_loss(residual, saturated, usable, config.huber),
+        "photometric": lit.photometric_loss(compared, seen.usable, config.huber),
+        "saturated": lit.saturated_loss(residual, seen.saturated, seen.usable, config.huber),
         "facing": surface.facing_loss(normals, rays, mask, config.cosine_floor),
-        "smoothness": surface.smoothness_loss(distance.log(), log_seen, mask),
-        "chroma": lit.chroma_loss(albedo_hs, image, light, mask & ~saturated),
+        "smoothness": surface.smoothness_loss(distance.log(), seen.guide, mask),
     }
+    if albedo_hs is not None:
+        terms["chroma"] = lit.chroma_loss(albedo_hs, image, light, mask & ~seen.saturated)
     if config.ssim > 0:
-        terms["ssim"] = lit.ssim_loss(image, rendered, usable)
+        terms["ssim"] = lit.ssim_loss(image, rendered, seen.usable)
     if config.specular > 0:
-        terms["specular"] = lit.specular_loss(normals, rays, saturated)
-    if config.albedo > 0:
+        terms["specular"] = lit.specular_loss(normals, rays, seen.saturated)
+    if config.albedo > 0 and albedo_hs is not None:
         terms["albedo"] = surface.albedo_loss(albedo_hs, mask)
     total = sum((getattr(config, name) * value for name, value in terms.items()), start=distance.new_zeros(()))
     return total, terms
@@ -73,7 +106,8 @@ def training_loss(
 def render_image(distance: Tensor, albedo_hs: Tensor, batch: FrameBatch, config: LossConfig) -> Tensor:
     """The image as the loss renders it, its gain matched to the one seen and clipped at white. (B, 3, H, W)"""
     normals = normals_from_distance(distance, batch.rays)
-    log_rendered = lit.rendered_log_brightness(distance, normals, batch.rays, batch.mask, batch.light, config)
+    indirect = lit.indirect_light(distance, batch.rays, batch.mask, batch.light, config)
+    log_rendered = lit.rendered_log_brightness(distance, normals, batch.rays, batch.light, indirect, config)
     v = brightness(batch.image)
     usable = informative(batch.image, batch.mask) & (v < config.white)
     gain = masked_median(v.clamp(min=_V_FLOOR).log() - log_rendered, usable)
