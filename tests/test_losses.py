@@ -428,3 +428,13 @@ def test_rendered_colour_is_brightness_times_the_encoded_albedo():
     red, green, blue = rendered_rgb(log_v, albedo, torch.tensor(2.0).reshape(1, 1, 1, 1)).flatten()
     assert torch.isclose(red, torch.tensor(0.5)) and torch.isclose(green, torch.tensor(0.5 * 0.4**0.5))
     assert torch.isclose(green, blue)
+
+
+def test_the_indirect_light_of_a_large_image_is_that_of_a_small_one():
+    def light(rows: int) -> torch.Tensor:
+        batch, _ = tube_batch(rows, rows * 5 // 4, batch=1)
+        found = indirect_light(batch.true_distance, batch.rays, batch.mask, batch.light, LossConfig(reflectance=0.6))
+        return torch.nn.functional.interpolate(found, (32, 40), mode="area")
+
+    assert torch.allclose(light(384).log(), light(128).log(), atol=0.03)
+    assert not torch.allclose(light(384).log(), light(32).log(), atol=0.03)

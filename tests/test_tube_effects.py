@@ -14,12 +14,23 @@ from jsonargparse import ArgumentError, ArgumentParser
 
 from lightdepth.datasets import read_c3vd
 from lightdepth.errors import InputError
-from lightdepth.tube import FilmConfig, ShapeConfig, Tube, TubeConfig, lens, realistic, render_sequence
+from lightdepth.tube import (
+    FilmConfig,
+    PathConfig,
+    ShapeConfig,
+    Tube,
+    TubeConfig,
+    camera_path,
+    lens,
+    realistic,
+    render_sequence,
+)
 from lightdepth.tube.exponents import REAL_RANGES, fit_exponents, scene_exponents, table
 from lightdepth.tube.path import image_flow
 from lightdepth.tube.sensor import SensorConfig, draw_sensor, expose
+from lightdepth.tube.shape import make_shape
 from lightdepth.tube.variant import REFLECTANCE, VariantTube, variant_frames
-from train.datamodule import FrameDataModule, TubeData, tube_scene
+from train.datamodule import FrameDataModule, TubeData, tube_config, tube_scene
 
 SENSOR_EFFECTS = {
     "exposure": (0.4, 0.4),
@@ -223,6 +234,27 @@ def test_realistic_colons_span_the_exponents_of_real_frames():
     for column, (low, high) in zip(found.T, REAL_RANGES.values(), strict=True):
         assert np.quantile(column, 0.05) <= low and np.quantile(column, 0.95) >= high
         assert ((column >= low) & (column <= high)).mean() > 0.5
+
+
+def test_turned_views_leave_the_path_and_look_aside():
+    shape = make_shape(SMALL.shape, np.random.default_rng(4))
+    ahead, aside = (
+        camera_path(shape, 12, 10.0, np.random.default_rng(5), config=PathConfig(turned=turned))
+        for turned in ((0.0, 0.0), (0.5, 1.2))
+    )
+    np.testing.assert_array_equal(ahead[:, :3, 3], aside[:, :3, 3])
+    angle = np.arccos((ahead[:, :3, 2] * aside[:, :3, 2]).sum(1).clip(-1, 1))
+    assert angle.min() > 0.4 and angle.max() < 1.3 and np.ptp(angle) > 0.2
+    np.testing.assert_allclose(
+        aside[:, :3, :3] @ aside[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (12, 1, 1)), atol=1e-9
+    )
+
+
+def test_two_scenes_of_five_of_the_mixed_family_are_hollows():
+    data = TubeData(family="mixed", mu=(0.0, 1.0))
+    turned = [max(tube_config(data, i).path.turned) > 0 for i in range(10)]
+    assert turned == [False, False, True, False, True] * 2
+    assert tube_config(data, 2).sensor.mu == (0.0, 1.0)
 
 
 @cache

@@ -40,7 +40,8 @@ class TubeData:
         mu: ends of the range of the light's spread.
         gamma: ends of the range of the response.
         reflectance: ends of the range of the wall's reflectance.
-        family: plain, or realistic: polyps, mucus, motion blur and all else (lightdepth.tube.realistic).
+        family: plain, realistic (polyps, mucus, motion blur and all else: lightdepth.tube.realistic), or mixed: two
+            scenes of five are no colons but hollows looked at from anywhere (lightdepth.tube.cavity).
         scene: ranges of one's own instead of the family's; mu, gamma and reflectance above hold in any case.
     """
 
@@ -52,7 +53,7 @@ class TubeData:
     mu: tuple[float, float] = (0.0, 3.5)
     gamma: tuple[float, float] = (1.8, 2.6)
     reflectance: tuple[float, float] = (0.0, 0.7)
-    family: Literal["plain", "realistic"] = "plain"
+    family: Literal["plain", "realistic", "mixed"] = "plain"
     scene: TubeConfig | None = None
 
 
@@ -60,6 +61,7 @@ _NO_TUBE = TubeData()
 _WHITE = LossConfig().white
 _VAL_SEEDS = 1_000_000  # validation colons are drawn from here on, so that more scenes never run into them
 _SEEDS_APART = 10_000
+_HOLLOWS = (2, 4)  # of five; lenses, in turn, meet both families
 
 
 class FrameDataModule(pl.LightningDataModule):
@@ -274,15 +276,18 @@ def tube_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> 
     """The frames of one synthetic colon, as batches of one."""
     from lightdepth.tube import lens, tube_frames
 
-    camera, config = lens(tube.lenses[index % len(tube.lenses)], *size), tube_config(tube)
+    camera, config = lens(tube.lenses[index % len(tube.lenses)], *size), tube_config(tube, index)
     return [to_batch(f, size) for f in tube_frames(seed, tube.frames, camera, travel=tube.travel, config=config)]
 
 
-def tube_config(tube: TubeData) -> TubeConfig:
-    """What the colons and their endoscopes are drawn from."""
-    from lightdepth.tube import realistic
+def tube_config(tube: TubeData, index: int = 0) -> TubeConfig:
+    """What the index-th colon and its endoscope are drawn from."""
+    from lightdepth.tube import cavity, realistic
 
-    config = tube.scene or (realistic() if tube.family == "realistic" else TubeConfig())
+    family = TubeConfig()
+    if tube.family != "plain":
+        family = cavity() if tube.family == "mixed" and index % 5 in _HOLLOWS else realistic()
+    config = tube.scene or family
     return replace(config, sensor=replace(config.sensor, mu=tube.mu, gamma=tube.gamma, reflectance=tube.reflectance))
 
 

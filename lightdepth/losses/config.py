@@ -35,7 +35,7 @@ class LossConfig:
         huber: where the photometric term turns from square to linear, in its space; 0 is L1.
         white: brightness from which a pixel counts as saturated.
         bounces: of the indirect light.
-        pool: pixels per side of an element of the indirect light.
+        pool: pixels per side of an element of the indirect light, in images of up to 128 rows; more in larger ones.
     """
 
     photometric: float = 1.0

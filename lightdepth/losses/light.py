@@ -23,6 +23,9 @@ _CHROMA_V = 0.1
 
 _SSIM_WINDOW = 5
 
+_POOL_ROWS = 128
+"""Height of the images up to which an element of the indirect light is `pool` pixels wide; wider in larger ones."""
+
 
 def indirect_light(distance: Tensor, rays: Tensor, mask: Tensor, light: LightTerms, config: LossConfig) -> Tensor:
     """E (B, 1, H, W) under the configuration's reflectance, or each image's own. No gradient flows through it."""
@@ -30,7 +33,9 @@ def indirect_light(distance: Tensor, rays: Tensor, mask: Tensor, light: LightTer
         light = light._replace(reflectance=torch.full_like(light.reflectance, config.reflectance))
     if not bool((light.reflectance > 0).any()):
         return torch.zeros_like(distance)
-    return indirect_irradiance(distance.detach(), rays, mask, light.co_located(), config.bounces, config.pool)
+    # The number of pairs of elements would grow with the fourth power of the image's size, and tell nothing new.
+    pool = max(config.pool, round(config.pool * distance.shape[-2] / _POOL_ROWS))
+    return indirect_irradiance(distance.detach(), rays, mask, light.co_located(), config.bounces, pool)
 
 
 def rendered_log_brightness(

@@ -1,12 +1,13 @@
 """The synthetic colon: shape, texture, light and camera path -> frames and a SLAM export with exact truth."""
 
 from lightdepth.tube.film import FilmConfig
-from lightdepth.tube.path import camera_path, lens, octagon
-from lightdepth.tube.scene import SensorConfig, ShapeConfig, TextureConfig, Tube, TubeConfig, realistic
+from lightdepth.tube.path import PathConfig, camera_path, lens, octagon
+from lightdepth.tube.scene import SensorConfig, ShapeConfig, TextureConfig, Tube, TubeConfig, cavity, realistic
 from lightdepth.tube.sequence import TubeSequence, render_sequence, tube_frames
 
 __all__ = [
     "FilmConfig",
+    "PathConfig",
     "SensorConfig",
     "ShapeConfig",
     "TextureConfig",
@@ -14,6 +15,7 @@ __all__ = [
     "TubeConfig",
     "TubeSequence",
     "camera_path",
+    "cavity",
     "lens",
     "octagon",
     "realistic",

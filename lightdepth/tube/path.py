@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -10,6 +12,20 @@ from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole
 from lightdepth.datasets.c3vd import C3VD
 from lightdepth.errors import InputError
 from lightdepth.tube.shape import TubeShape
+
+
+@dataclass(frozen=True)
+class PathConfig:
+    """How the endoscope moves; pairs are the ends of a uniform range.
+
+    Args:
+        sway: deviation from the centreline, as a share of the radius; it ends at 0.3 / 0.13 times as much.
+        turned: radians by which each view is turned away from the way ahead, in any direction: beyond 0 the walls are
+            looked at from the front, and neighbouring frames have little to do with each other.
+    """
+
+    sway: float = 0.13
+    turned: tuple[float, float] = (0.0, 0.0)
 
 
 def lens(kind: str, width: int, height: int) -> CameraModel:
@@ -33,7 +49,12 @@ def octagon(camera: CameraModel, cut: float = 0.2) -> np.ndarray:
 
 
 def camera_path(
-    shape: TubeShape, count: int, travel: float, rng: np.random.Generator, start: float | None = None
+    shape: TubeShape,
+    count: int,
+    travel: float,
+    rng: np.random.Generator,
+    start: float | None = None,
+    config: PathConfig = PathConfig(),
 ) -> np.ndarray:
     """Poses world_from_cam (count, 4, 4) [mm]: `travel` mm along the tube, with sway and looking about."""
     length = (len(shape.centers) - 1) * shape.step
@@ -57,7 +78,8 @@ def camera_path(
     # Parallel-transported frames turn slowly: interpolate so that the path has no steps.
     side = side * (1 - part) + shape.frames[floor + 1, 1] * part
     up = up * (1 - part) + shape.frames[floor + 1, 2] * part
-    sway = np.stack([wander(0.13), wander(0.13)], -1).clip(-0.3, 0.3) * radius[:, None]
+    furthest = 0.3 * config.sway / 0.13
+    sway = np.stack([wander(config.sway), wander(config.sway)], -1).clip(-furthest, furthest) * radius[:, None]
     positions = centers + sway[:, :1] * side + sway[:, 1:] * up
     ahead = np.minimum(floor + round(18 / shape.step), len(shape.centers) - 1)
     forward = shape.centers[ahead] - positions
@@ -65,13 +87,23 @@ def camera_path(
     look = np.stack([wander(0.12), wander(0.12)], -1)
     roll = wander(0.15)
 
+    aside = [np.eye(3)] * count
+    if max(config.turned) > 0:
+        (own,) = rng.spawn(1)  # views straight ahead stay as they were
+        angle, towards = own.uniform(*config.turned, count), own.uniform(0, 2 * np.pi, count)
+        aside = list(
+            Rotation.from_rotvec(
+                np.stack([np.cos(towards), np.sin(towards), 0 * angle], -1) * angle[:, None]
+            ).as_matrix()
+        )
+
     poses = np.tile(np.eye(4), (count, 1, 1))
     for i in range(count):
         right = np.cross(up[i], forward[i])
         right /= np.linalg.norm(right)
         base = np.stack([right, np.cross(forward[i], right), forward[i]], -1)
         turned = Rotation.from_euler("xyz", [look[i, 0], look[i, 1], roll[i]]).as_matrix()
-        poses[i, :3, :3] = base @ turned
+        poses[i, :3, :3] = base @ aside[i] @ turned
         poses[i, :3, 3] = positions[i]
     return poses
 

@@ -20,7 +20,7 @@ from lightdepth.camera import CameraModel
 from lightdepth.photometry import PhotometricCalibration, irradiance
 from lightdepth.radiosity import form_factors
 from lightdepth.tube.film import FilmConfig, cover, fine_relief
-from lightdepth.tube.path import image_flow
+from lightdepth.tube.path import PathConfig, image_flow
 from lightdepth.tube.polyps import tinted
 from lightdepth.tube.sensor import SensorConfig, draw_sensor, expose
 from lightdepth.tube.shape import ShapeConfig, TubeShape, make_shape, smooth_noise
@@ -33,6 +33,7 @@ class TubeConfig:
     texture: TextureConfig = field(default_factory=TextureConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     film: FilmConfig = field(default_factory=FilmConfig)
+    path: PathConfig = field(default_factory=PathConfig)
     patch: float = 3.5  # mm along s, of the patches that light each other
     least_cosine: float = 0.0  # normals interpolated across a fold's edge may look away: no further than this; 0 as is
 
@@ -90,6 +91,26 @@ def realistic() -> TubeConfig:
         patch=4.4,
         least_cosine=0.08,
     )
+
+
+def cavity() -> TubeConfig:
+    """Hollows of any form, looked at from anywhere in any direction, under any light: what keeps a network that is
+    taught by colons from taking every place for one. Walls, texture and sensor are those of `realistic`."""
+    base = realistic()
+    shape = ShapeConfig(
+        length=110.0,
+        radius=(8.0, 28.0),
+        bend=(0.0, 1.6),
+        fold_spacing=(10.0, 45.0),
+        fold_depth=(0.0, 0.3),
+        fold_width=(1.6, 6.0),
+        bump=(0.06, 0.22),
+        crescent=(0.5, 1.0),
+        waviness=(0.3, 2.5),
+        polyps=(0, 4),
+    )
+    path = PathConfig(sway=0.26, turned=(0.2, 1.6))
+    return replace(base, shape=shape, path=path, sensor=replace(base.sensor, mu=(0.0, 3.6), gamma=(1.4, 2.6)))
 
 
 @dataclass(frozen=True)

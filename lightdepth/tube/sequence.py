@@ -35,10 +35,11 @@ def render_sequence(
     """A colon drawn from `seed`, seen in `count` frames along `travel` mm. Frames carry the light's true calibration
     with gain 1 (exposure is automatic, so the true gain differs per frame), distance and pose in mm."""
     rng = np.random.default_rng(seed)
-    tube = kind(config or TubeConfig(), rng, light)
+    config = config or TubeConfig()
+    tube = kind(config, rng, light)
     mask = octagon(camera)
     frames = []
-    for i, pose in enumerate(camera_path(tube.shape, count, travel, rng)):
+    for i, pose in enumerate(camera_path(tube.shape, count, travel, rng, config=config.path)):
         view = tube.view(pose, camera, mask, rng)
         frames.append(
             Frame(
