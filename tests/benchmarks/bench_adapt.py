@@ -2,8 +2,8 @@
 
 Source: pinhole, mu 0-.5, gamma 2.4-2.6, reflectance 0-.2, plain colons. Target: fisheye, mu 3-3.5, gamma 1.8-2.0,
 reflectance .5-.7, realistic colons. All 80x64. Start: self-supervised on 240 source frames. At home: self-supervised
-on 480 target frames of other colons, from nothing (not thousands: that took too long). Adapted: on 200 target
-frames of 25 colons, by `lightdepth adapt`. Judged on 48 frames of 12 target colons that nobody saw, and on as many of
+on 2000 target frames of 250 other colons, from nothing. Adapted: on 200 target frames of 25 colons, by `lightdepth
+adapt`. Judged on 48 frames of 12 target colons that nobody saw, and on as many of
 the source. Every colon's light is known, as of a calibrated endoscope. LIGHTDEPTH_BENCH names a folder to keep what was
 made in.
 """
@@ -31,7 +31,7 @@ from train.datamodule import TubeData, tube_config
 SIZE = (80, 64)
 SOURCE = TubeData(lenses=("pinhole",), mu=(0.0, 0.5), gamma=(2.4, 2.6), reflectance=(0.0, 0.2), family="plain")
 TARGET = TubeData(lenses=("fisheye",), mu=(3.0, 3.5), gamma=(1.8, 2.0), reflectance=(0.5, 0.7), family="realistic")
-TRAIN_STEPS = 1000
+STEPS = {"start": 1000, "home": 2000}
 
 
 def colon_frames(domain: TubeData, seed: int, count: int) -> list[Frame]:
@@ -47,7 +47,7 @@ def trained(domain: TubeData, scenes: int, seed: int, run: Path) -> str:
         ranges = {name: list(getattr(domain, name)) for name in ("mu", "gamma", "reflectance")}
         tube = [part for k, v in {**values, **ranges}.items() for part in (f"--data.tube.{k}", str(v))]
         fixed = ["--data.size", str(list(SIZE)), "--model.loss.reflectance", "null", "--seed", str(seed)]
-        train(["-o", str(run), *tube, *fixed, "--trainer.max_steps", str(TRAIN_STEPS), "--fit.monitor", "last"])
+        train(["-o", str(run), *tube, *fixed, "--trainer.max_steps", str(STEPS[run.name]), "--fit.monitor", "last"])
     return str(model)
 
 
@@ -78,7 +78,7 @@ def line(name: str, on_target: dict[str, float], on_source: dict[str, float]) ->
     return f"{name:<28} target AbsRel RMSE MedAE delta1  {numbers}   source AbsRel {on_source['abs_rel_median']:.4f}"
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_two_hundred_frames_close_half_of_the_gap_and_cost_a_start_at_home_little(seed, tmp_path):
     kept = Path(os.environ.get("LIGHTDEPTH_BENCH") or tmp_path) / f"seed{seed}"
     first = 70_000 + 1000 * seed
@@ -86,9 +86,9 @@ def test_two_hundred_frames_close_half_of_the_gap_and_cost_a_start_at_home_littl
     at_source = [f for i in range(12) for f in colon_frames(SOURCE, first + 600 + i, 4)]
     folders = target_folders(kept / "target", range(first, first + 25), 8)
     start = trained(SOURCE, 30, 10 + seed, kept / "start")
-    home = trained(TARGET, 60, 20 + seed, kept / "home")
+    home = trained(TARGET, 250, 20 + seed, kept / "home")
     made = {"closed form": "decline", "start": start, "at home": home}
-    settings = {"default": {}, "replay": {"replay": 10}, "anchor": {"anchor": 1.0}}
+    settings = {"default": {}, "replay": {"replay": 10}}
     for name, changes in settings.items():
         for origin, checkpoint in (("start", start), ("at home", home)):
             run = kept / f"{origin} {name}".replace(" ", "_")
