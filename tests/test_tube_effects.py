@@ -257,6 +257,18 @@ def test_two_scenes_of_five_of_the_mixed_family_are_hollows():
     assert tube_config(data, 2).sensor.mu == (0.0, 1.0)
 
 
+def test_scenes_of_the_mixed_family_are_seen_through_fields_of_their_own():
+    data = TubeData(family="mixed", frames=1, lenses=("telescope",))
+    shares = [float(tube_scene(data, seed, 0, (60, 48))[0].mask.float().mean()) for seed in range(6)]
+    assert min(shares) > 0.3 and max(shares) < 1 and np.ptp(shares) > 0.2
+    again = tube_scene(data, 0, 0, (60, 48))[0]
+    assert (
+        float(again.mask.float().mean()) == shares[0]
+        and float(again.image[~again.mask.expand_as(again.image)].max()) == 0
+    )
+    assert float(again.rays[0, 2].min()) > np.cos(np.radians(45))
+
+
 @cache
 def variants(strength: str):
     return variant_frames(3, 2, CAMERA, strength, travel=10.0)

@@ -36,12 +36,13 @@ class TubeData:
         val_scenes: colons to validate on.
         frames: per colon.
         travel: mm along the colon over which its frames are spread.
-        lenses: in turn: c3vd, fisheye, pinhole.
+        lenses: in turn: c3vd, fisheye, pinhole, telescope.
         mu: ends of the range of the light's spread.
         gamma: ends of the range of the response.
         reflectance: ends of the range of the wall's reflectance.
         family: plain, realistic (polyps, mucus, motion blur and all else: lightdepth.tube.realistic), or mixed: two
-            scenes of five are no colons but hollows looked at from anywhere (lightdepth.tube.cavity).
+            scenes of five are no colons but hollows looked at from anywhere (lightdepth.tube.cavity), and every scene
+            has a field of view of its own.
         scene: ranges of one's own instead of the family's; mu, gamma and reflectance above hold in any case.
     """
 
@@ -61,6 +62,7 @@ _NO_TUBE = TubeData()
 _WHITE = LossConfig().white
 _VAL_SEEDS = 1_000_000  # validation colons are drawn from here on, so that more scenes never run into them
 _SEEDS_APART = 10_000
+_FIELD = 17  # tells the draw of the field of view from the colon's own
 _HOLLOWS = (2, 4)  # of five; lenses, in turn, meet both families
 
 
@@ -274,10 +276,12 @@ def augmented(batch: FrameBatch, generator: torch.Generator) -> FrameBatch:
 
 def tube_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> list[FrameBatch]:
     """The frames of one synthetic colon, as batches of one."""
-    from lightdepth.tube import lens, tube_frames
+    from lightdepth.tube import any_field, lens, tube_frames
 
     camera, config = lens(tube.lenses[index % len(tube.lenses)], *size), tube_config(tube, index)
-    return [to_batch(f, size) for f in tube_frames(seed, tube.frames, camera, travel=tube.travel, config=config)]
+    mask = any_field(camera, np.random.default_rng([seed, _FIELD])) if tube.family == "mixed" else None
+    frames = tube_frames(seed, tube.frames, camera, travel=tube.travel, config=config, mask=mask)
+    return [to_batch(frame, size) for frame in frames]
 
 
 def tube_config(tube: TubeData, index: int = 0) -> TubeConfig:

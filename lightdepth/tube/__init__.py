@@ -1,7 +1,7 @@
 """The synthetic colon: shape, texture, light and camera path -> frames and a SLAM export with exact truth."""
 
 from lightdepth.tube.film import FilmConfig
-from lightdepth.tube.path import PathConfig, camera_path, lens, octagon
+from lightdepth.tube.path import PathConfig, any_field, camera_path, lens, octagon
 from lightdepth.tube.scene import SensorConfig, ShapeConfig, TextureConfig, Tube, TubeConfig, cavity, realistic
 from lightdepth.tube.sequence import TubeSequence, render_sequence, tube_frames
 
@@ -14,6 +14,7 @@ __all__ = [
     "Tube",
     "TubeConfig",
     "TubeSequence",
+    "any_field",
     "camera_path",
     "cavity",
     "lens",

@@ -29,16 +29,18 @@ class PathConfig:
 
 
 def lens(kind: str, width: int, height: int) -> CameraModel:
-    """A typical lens: "pinhole" (90 degrees across), "fisheye" (136 degrees across) or "c3vd"."""
+    """A typical lens: "pinhole" (90 degrees across), "telescope" (70: rigid optics), "fisheye" (136) or "c3vd"."""
     centre = (width / 2, height / 2)
     if kind == "pinhole":
         return Pinhole(width, height, width / 2, width / 2, *centre)
+    if kind == "telescope":
+        return Pinhole(width, height, 0.714 * width, 0.714 * width, *centre)
     if kind == "fisheye":
         f = 0.52 * width
         return KannalaBrandt(width, height, f, f, *centre, -0.13, -0.005, 0.0015, -0.0001)
     if kind == "c3vd":
         return C3VD.resized(width, height)
-    raise InputError(f"lens {kind!r}; expected pinhole, fisheye or c3vd")
+    raise InputError(f"lens {kind!r}; expected pinhole, telescope, fisheye or c3vd")
 
 
 def octagon(camera: CameraModel, cut: float = 0.2) -> np.ndarray:
@@ -46,6 +48,15 @@ def octagon(camera: CameraModel, cut: float = 0.2) -> np.ndarray:
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     from_corner = np.minimum(u, camera.width - u) + np.minimum(v, camera.height - v)
     return from_corner > cut * camera.height
+
+
+def any_field(camera: CameraModel, rng: np.random.Generator) -> np.ndarray:
+    """(H, W) bool: a field of view as some endoscope's mask has it, an octagon or a circle, not quite centred."""
+    if rng.random() < 0.5:
+        return octagon(camera, rng.uniform(0.05, 0.35))
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x, y = (np.array([camera.width, camera.height]) / 2) * rng.uniform(0.94, 1.06, 2)
+    return np.hypot(u - x, v - y) < rng.uniform(0.4, 0.65) * camera.height
 
 
 def camera_path(

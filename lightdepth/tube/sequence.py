@@ -31,13 +31,15 @@ def render_sequence(
     light: PhotometricCalibration | None = None,
     progress: Callable[[int, int], None] | None = None,
     kind: type[Tube] = Tube,
+    mask: np.ndarray | None = None,
 ) -> TubeSequence:
     """A colon drawn from `seed`, seen in `count` frames along `travel` mm. Frames carry the light's true calibration
-    with gain 1 (exposure is automatic, so the true gain differs per frame), distance and pose in mm."""
+    with gain 1 (exposure is automatic, so the true gain differs per frame), distance and pose in mm. `mask` (H, W) is
+    the field of view, an octagon if left out."""
     rng = np.random.default_rng(seed)
     config = config or TubeConfig()
     tube = kind(config, rng, light)
-    mask = octagon(camera)
+    mask = octagon(camera) if mask is None else mask
     frames = []
     for i, pose in enumerate(camera_path(tube.shape, count, travel, rng, config=config.path)):
         view = tube.view(pose, camera, mask, rng)
@@ -65,8 +67,9 @@ def tube_frames(
     travel: float = 60.0,
     config: TubeConfig | None = None,
     light: PhotometricCalibration | None = None,
+    mask: np.ndarray | None = None,
 ) -> list[Frame]:
     """Frames for training: `count` views spread over `travel` mm of one colon (C3VD's lens at 160x128 by default)."""
     camera = camera or lens("c3vd", 160, 128)
-    frames = render_sequence(seed, count, camera, travel, config, light).frames
+    frames = render_sequence(seed, count, camera, travel, config, light, mask=mask).frames
     return [replace(frame, name=f"tube{seed}_{frame.name}") for frame in frames]

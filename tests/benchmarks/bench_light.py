@@ -65,7 +65,7 @@ def test_what_the_indirect_light_costs(name, size):
         lit = seconds(lambda b=batch, d=distance: indirect_light(d, b.rays, b.mask, b.light, with_light), device)
         rest, passed = seconds(loss, device), seconds(trained, device)
         print(
-            f"\n{name} {size[0]}x{size[1]}, batch {count}: {1000 * lit / count:.1f} ms an image, {lit / rest:.2f} of the "
-            f"rest of the loss, {lit / (rest + passed):.2f} of loss and network"
+            f"\n{name} {size[0]}x{size[1]}, batch {count}: {1000 * lit / count:.1f} ms an image, {lit / rest:.2f} of "
+            f"the rest of the loss, {lit / (rest + passed):.2f} of loss and network"
         )
         assert torch.isfinite(indirect_light(distance, batch.rays, batch.mask, batch.light, with_light)).all()
