@@ -40,8 +40,8 @@ class TubeData:
         mu: ends of the range of the light's spread.
         gamma: ends of the range of the response.
         reflectance: ends of the range of the wall's reflectance.
-        family: plain, realistic (polyps, mucus, motion blur and all else: lightdepth.tube.realistic), or mixed: two
-            scenes of five are no colons but hollows looked at from anywhere (lightdepth.tube.cavity), and every scene
+        family: plain, realistic (polyps, mucus, motion blur and all else: lightdepth.tube.realistic), or mixed: one
+            scene of five is no colon but a hollow looked at from anywhere (lightdepth.tube.cavity), and every scene
             has a field of view of its own.
         scene: ranges of one's own instead of the family's; mu, gamma and reflectance above hold in any case.
     """
@@ -63,7 +63,7 @@ _WHITE = LossConfig().white
 _VAL_SEEDS = 1_000_000  # validation colons are drawn from here on, so that more scenes never run into them
 _SEEDS_APART = 10_000
 _FIELD = 17  # tells the draw of the field of view from the colon's own
-_HOLLOWS = (2, 4)  # of five; lenses, in turn, meet both families
+_HOLLOWS = (2,)  # of five; lenses, in turn, meet both families
 
 
 class FrameDataModule(pl.LightningDataModule):
