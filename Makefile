@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= runs/demo
 export OMP_WAIT_POLICY = passive
 
-.PHONY: setup demo test test-slow lint format bench clean
+.PHONY: setup demo test test-slow lint format bench ablation clean
 
 setup: $(VENV)/.ready
 
@@ -35,6 +35,10 @@ format: setup
 
 bench: setup
 	$(BIN)/python -m pytest tests/benchmarks -o python_files='bench_*.py' -o addopts= -s
+
+# About an hour and a quarter on one core; what is already there is kept.
+ablation: setup
+	$(BIN)/lightdepth ablate --config configs/ablation/lightdepth.yaml -o runs/ablation --table docs/ablation.md
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

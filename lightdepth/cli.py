@@ -26,6 +26,7 @@ ORDER = (
     "select",
     "train",
     "adapt",
+    "ablate",
     "predict",
     "sparse",
     "densify",

@@ -21,7 +21,7 @@ from lightdepth.network import Estimate, NetworkConfig, build_network, load_pret
 from lightdepth.network.model import full_precision
 
 _NETWORK, _LOSS = NetworkConfig(), LossConfig()
-_MIN_RAY_Z = 0.15  # beyond 81 degrees from the axis, depth says little about distance
+MIN_RAY_Z = 0.15  # beyond 81 degrees from the axis, depth says little about distance
 SCHEDULES = ("one_cycle", "cosine", "constant")
 
 
@@ -119,7 +119,7 @@ class LightDepth(pl.LightningModule):
 
         ray_z = batch.rays[:, 2:3]
         truth = depth_from_distance(batch.true_distance, ray_z)
-        valid = batch.true_valid & (ray_z > _MIN_RAY_Z)
+        valid = batch.true_valid & (ray_z > MIN_RAY_Z)
         with full_precision(self.device):
             closed_form = log_closed_form(batch.image, batch.mask, batch.rays, batch.light).exp()
         self.errors.update(depth_from_distance(distance, ray_z), truth, valid)

@@ -5,6 +5,10 @@ from __future__ import annotations
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
 
 TRAINER_DEFAULTS = {
     "trainer.max_steps": 1500,
@@ -24,14 +28,33 @@ def train(argv: list[str] | None = None) -> int:
     Lightning's Trainer is a dotted override. `--resume` without --config takes the run's own config.yaml.
     """
     import lightning.pytorch as pl
+
+    from .fit import check_output, fit
+
+    given = list(sys.argv[1:] if argv is None else argv)
+    parser = training_parser()
+    config = parser.parse_args(_with_own_config(given))
+
+    output = Path(config.output)
+    check_output(output, config.resume, config.overwrite)  # before the seconds that the rest takes
+    pl.seed_everything(config.seed, workers=True, verbose=False)
+    made = parser.instantiate(config)
+    text = as_yaml(parser, config)
+    flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given, "settings": made.fit}
+    fit(made.model, made.data, output, vars(made.trainer), text, config.seed, **flags)
+    return 0
+
+
+def training_parser() -> ArgumentParser:
+    """Every option of a training run: of the model, its data, how it is watched, and Lightning's Trainer."""
+    import lightning.pytorch as pl
     from jsonargparse import ArgumentParser
 
     from lightdepth.module import LightDepth
 
     from .datamodule import FrameDataModule
-    from .fit import FitConfig, check_output, fit
+    from .fit import FitConfig
 
-    given = list(sys.argv[1:] if argv is None else argv)
     parser = ArgumentParser(
         prog="lightdepth train", description="Train LightDepth without ground truth.", allow_abbrev=False
     )
@@ -49,19 +72,15 @@ def train(argv: list[str] | None = None) -> int:
     parser.link_arguments("seed", "data.seed")
     parser.link_arguments("data.size", "model.rows", compute_fn=lambda size: size[1])
     parser.set_defaults(TRAINER_DEFAULTS)
-    config = parser.parse_args(_with_own_config(given))
+    return parser
 
-    output = Path(config.output)
-    check_output(output, config.resume, config.overwrite)  # before the seconds that the rest takes
+
+def as_yaml(parser: ArgumentParser, config: Namespace) -> str:
+    """The settings of a run, without where it goes and what becomes of what is there."""
     kept = config.clone()
     for key in ("config", "output", "resume", "overwrite"):
         kept.pop(key, None)
-    pl.seed_everything(config.seed, workers=True, verbose=False)
-    made = parser.instantiate(config)
-    text = parser.dump(kept, skip_validation=True)
-    flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given, "settings": made.fit}
-    fit(made.model, made.data, output, vars(made.trainer), text, config.seed, **flags)
-    return 0
+    return parser.dump(kept, skip_validation=True)
 
 
 def _with_own_config(argv: list[str]) -> list[str]:

@@ -60,6 +60,7 @@ class TubeData:
 
 _NO_TUBE = TubeData()
 _WHITE = LossConfig().white
+_MAX_REFLECTANCE = 0.95
 _VAL_SEEDS = 1_000_000  # validation colons are drawn from here on, so that more scenes never run into them
 _SEEDS_APART = 10_000
 _FIELD = 17  # tells the draw of the field of view from the colon's own
@@ -88,6 +89,9 @@ class FrameDataModule(pl.LightningDataModule):
         batch_size: frames in a step.
         num_workers: processes that read frames.
         augment: exposure and flips.
+        reflectance_error: added to what is known of each wall's reflectance: what a wrong calibration costs.
+        random_reflectance: ends of a range from which each image's reflectance is drawn anew at every step, whatever is
+            known of it: for networks that have it as an input and are to obey it.
         seed: of colons, order and augmentation.
     """
 
@@ -109,6 +113,8 @@ class FrameDataModule(pl.LightningDataModule):
         batch_size: int = 4,
         num_workers: int = 0,
         augment: bool = True,
+        reflectance_error: float = 0.0,
+        random_reflectance: tuple[float, float] | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -118,6 +124,9 @@ class FrameDataModule(pl.LightningDataModule):
         self.frames, self.tube, self.seed = frames, tube, seed
         self.size, self.batch_size, self.num_workers = (int(size[0]), int(size[1])), batch_size, num_workers
         self.augment, self.held_out, self.halves = augment, held_out, halves
+        self.reflectance_error, self.random_reflectance = reflectance_error, random_reflectance
+        if random_reflectance is not None and not 0 <= random_reflectance[0] <= random_reflectance[1] < 1:
+            raise InputError(f"data: random_reflectance {random_reflectance}; expected 0 <= low <= high < 1")
         if not 0 < held_out < 1:
             raise InputError(f"data: held_out {held_out}; expected a share above 0 and below 1")
         if halves and batch_size < 2:
@@ -160,14 +169,26 @@ class FrameDataModule(pl.LightningDataModule):
             val.append(_Frames(_open(path, of, self.reading), self.size, path))
         if self.tube.scenes + self.tube.val_scenes > 0:
             with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
-                first = self.seed * _SEEDS_APART
-                train += self._colons(first, self.tube.scenes, bar)
-                val += self._colons(first + _VAL_SEEDS, self.tube.val_scenes, bar)
+                to_train_on, to_validate_on = colon_seeds(self.tube, self.seed)
+                train += self._colons(to_train_on, bar)
+                val += self._colons(to_validate_on, bar)
         if not train:
             raise InputError("nothing to train on; give --data.sequences FOLDER, or --data.tube.scenes N")
         if not val:
             raise InputError("nothing to validate on; give --data.val_sequences FOLDER, or --data.tube.val_scenes N")
         self._train, self._val = ConcatDataset(train), ConcatDataset(val)
+
+    def share(self, other: FrameDataModule) -> bool:
+        """Takes the frames of `other`, which is set up, if they are what `setup` would read and render."""
+        if self._origin() != other._origin():
+            return False
+        self._train, self._val = other._train, other._val
+        return True
+
+    def _origin(self) -> tuple[Any, ...]:
+        """What the frames follow from."""
+        read = (self.sequences, self.val_sequences, self.split, self.root, self.frames, self.reading, self.held_out)
+        return (*read, self.tube, self.size, self.seed)
 
     def _folders(self) -> list[list[tuple[str, Listed | None]]]:
         """The folders to train and to validate on, with what a split says of each; a split's become the sequences."""
@@ -185,10 +206,9 @@ class FrameDataModule(pl.LightningDataModule):
         self.sequences, self.val_sequences = ([path for path, _ in part] for part in both)
         return both
 
-    def _colons(self, first_seed: int, count: int, bar: Progress) -> list[Dataset]:
+    def _colons(self, seeds: range, bar: Progress) -> list[Dataset]:
         made: list[Dataset] = []
-        for i in range(count):
-            seed = first_seed + i
+        for i, seed in enumerate(seeds):
             frames = tube_scene(self.tube, seed, i, self.size)
             made.append(_Cached(frames, [f"colon {seed} frame {k}" for k in range(len(frames))]))
             bar.advance()
@@ -228,13 +248,21 @@ class FrameDataModule(pl.LightningDataModule):
         return self._loader(self._val, shuffle=False)
 
     def on_after_batch_transfer(self, batch: FrameBatch, dataloader_idx: int) -> FrameBatch:
+        if self.reflectance_error:
+            batch = with_reflectance(batch, batch.light.reflectance + self.reflectance_error)
         trainer = self.trainer
-        if not self.augment or trainer is None or not trainer.training:
+        if trainer is None or not trainer.training:
             return batch
         # Every process of a distributed run augments in its own way.
         seed = self.seed * 1_000_003 + trainer.global_step + trainer.global_rank * 1_000_000_007
         generator = torch.Generator().manual_seed(seed)
-        return augmented(batch, generator)
+        if self.augment:
+            batch = augmented(batch, generator)
+        if self.random_reflectance is not None:
+            low, high = self.random_reflectance
+            drawn = low + (high - low) * torch.rand(len(batch.image), 1, 1, 1, generator=generator)
+            batch = with_reflectance(batch, drawn.to(batch.image.device))
+        return batch
 
     def _loader(self, dataset: Dataset, **options: Any) -> DataLoader:
         return DataLoader(
@@ -272,6 +300,17 @@ def augmented(batch: FrameBatch, generator: torch.Generator) -> FrameBatch:
     gamma = batch.light.gamma
     exposed = encode(exposure * decode(batch.image, gamma), gamma).clamp(max=1)
     return batch._replace(image=torch.where(brightness(batch.image) >= _WHITE, batch.image, exposed))
+
+
+def colon_seeds(tube: TubeData, seed: int) -> tuple[range, range]:
+    """The colons that data of a seed train and validate on."""
+    first = seed * _SEEDS_APART
+    return range(first, first + tube.scenes), range(first + _VAL_SEEDS, first + _VAL_SEEDS + tube.val_scenes)
+
+
+def with_reflectance(batch: FrameBatch, reflectance: torch.Tensor) -> FrameBatch:
+    """The batch with another reflectance (B, 1, 1, 1) of the wall, kept where light from wall to wall converges."""
+    return batch._replace(light=batch.light._replace(reflectance=reflectance.clamp(0, _MAX_REFLECTANCE)))
 
 
 def tube_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> list[FrameBatch]:

@@ -26,8 +26,8 @@ from torch import Tensor, nn
 from lightdepth.decline import log_closed_form
 from lightdepth.photometry import LightTerms
 
-CHANNELS = {"rgb": 3, "closed_form": 1, "ray_z": 1, "mask": 1}
-"""Inputs to choose from, and how many channels each takes."""
+CHANNELS = {"rgb": 3, "closed_form": 1, "ray_z": 1, "mask": 1, "reflectance": 1}
+"""Inputs to choose from, and how many channels each takes; reflectance is the wall's, as the calibration has it."""
 
 OUTPUTS = ("residual", "absolute", "free")
 
@@ -60,6 +60,7 @@ def network_inputs(
         "closed_form": log_closed - mean,
         "ray_z": torch.where(mask, rays[:, 2:3], 0),
         "mask": mask.to(image.dtype),
+        "reflectance": torch.where(mask, light.reflectance, 0),
     }
     return torch.cat([made[name] for name in names], 1), log_closed
 

@@ -36,7 +36,7 @@ class NetworkConfig:
 
     Args:
         kind: "tiny" (0.5 M parameters), "unet" (ResNet encoder) or "dpt" (vision transformer, extra `dpt`).
-        inputs: channels that go in, of rgb, closed_form, ray_z, mask.
+        inputs: channels that go in, of rgb, closed_form, ray_z, mask, reflectance.
         output: "residual" (a correction of the closed form) or "absolute" (log distance itself), both with its scale;
             or "free" (log distance with a scale of its own, for losses with a fixed gain).
         encoder: of unet resnet18 (14 M), resnet34, resnet50; of dpt vits14 (25 M), vitb14, vitl14, vitt14; null takes

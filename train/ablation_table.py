@@ -1,0 +1,307 @@
+"""The table of an ablation: errors as ratios to the closed form's, over seeds, and differences to the base.
+
+Notation: ratio, an error of a network divided by the closed form's on the same frames; overall, the geometric mean of a
+training's ratios over all sets and metrics. Differences are taken seed by seed, because the trainings of a seed share
+colons and weights' seed; one is clear where its mean is larger than its spread (greatest minus least) over the seeds.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lightdepth.run import git_revision
+
+from .datamodule import TubeData, colon_seeds
+
+if TYPE_CHECKING:
+    from .ablation import JudgedColons, Row
+
+METRICS = {"abs_rel": "AbsRel", "rmse_mm": "RMSE", "medae_mm": "MedAE"}
+_TOLD = {"true": "the true one", "wrong": "one .3 too high", "estimated": "one estimated per colon, without truth"}
+_SHOWN_POINTS = 6
+
+
+@dataclass(frozen=True)
+class Result:
+    """One training: `errors` by what it was told at judging, by set, by metric; `failed` says why there are none."""
+
+    row: str
+    seed: int
+    steps: int
+    parameters: int
+    seconds: float
+    curve: list[tuple[int, float]]
+    errors: dict[str, dict[str, dict[str, float]]]
+    closed_form: dict[str, dict[str, float]]
+    failed: str = ""
+
+    def ratios(self, told: str) -> np.ndarray:
+        """(sets, metrics)."""
+        of = self.errors[told]
+        return np.array([[of[name][key] / self.closed_form[name][key] for key in METRICS] for name in self.closed_form])
+
+    def overall(self, told: str | None = None) -> float:
+        return float(np.exp(np.log(self.ratios(told or next(iter(self.errors)))).mean()))
+
+
+@dataclass(frozen=True)
+class Table:
+    """What was asked for and what came out."""
+
+    title: str
+    rows: Sequence[Row]
+    judged: Sequence[JudgedColons]
+    results: Sequence[Result]
+    tube: TubeData
+    size: tuple[int, int]
+    batch_size: int
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of the table: `values` by seed, each (sets, metrics), and the same of the base."""
+
+    name: str
+    row: Row
+    values: dict[int, np.ndarray]
+    base: dict[int, np.ndarray]
+
+    @property
+    def seeds(self) -> list[int]:
+        return sorted(self.values.keys() & self.base.keys())
+
+    def cells(self) -> np.ndarray:
+        """(seeds, sets, metrics)."""
+        return np.stack(list(self.values.values()))
+
+    def overall(self) -> np.ndarray:
+        """(seeds,)"""
+        return _overall(self.cells())
+
+    def differences(self) -> np.ndarray:
+        """Of the cells to the base's, (seeds, sets, metrics)."""
+        return np.stack([self.values[seed] - self.base[seed] for seed in self.seeds])
+
+    def overall_differences(self) -> np.ndarray:
+        """(seeds,)"""
+        return np.array([float(_overall(self.values[s]) - _overall(self.base[s])) for s in self.seeds])
+
+    def verdict(self) -> str:
+        """worse, better, no clear difference, or one seed."""
+        found = self.overall_differences()
+        if len(found) < 2:
+            return "one seed"
+        if not clear(found):
+            return "no clear difference"
+        return "worse" if found.mean() > 0 else "better"
+
+
+def clear(differences: np.ndarray) -> np.ndarray:
+    """Whether the mean over seeds (the first axis, at least two) is larger than the spread."""
+    return (len(differences) > 1) & (np.abs(differences.mean(0)) > np.ptp(differences, axis=0))
+
+
+def _overall(ratios: np.ndarray) -> np.ndarray:
+    return np.exp(np.log(ratios).mean((-2, -1)))
+
+
+def lines(table: Table) -> list[Line]:
+    """Of the rows that were trained; the base first."""
+    first = table.rows[0]
+    base = {r.seed: r.ratios(first.told[0]) for r in table.results if r.row == first.name and not r.failed}
+    found = []
+    for row in table.rows:
+        of = [r for r in table.results if r.row == row.name and not r.failed]
+        for told in row.told if of else ():
+            name = f"{row.name}; told {_TOLD[told]}" if len(row.told) > 1 else row.name
+            found.append(Line(name, row, {r.seed: r.ratios(told) for r in of}, base))
+    return found
+
+
+def write_table(table: Table, output: Path, copy: Path | None) -> None:
+    """ablation.md (and its copy), .csv with every number, .json with what the table says."""
+    text = markdown(table)
+    output.mkdir(parents=True, exist_ok=True)
+    summary = [_summary(line) for line in lines(table)]
+    _write(output / "ablation.json", json.dumps(summary, indent=1) + "\n")
+    _write(output / "ablation.csv", _csv(table))
+    _write(output / "ablation.md", text)
+    if copy is not None:
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        _write(copy, text)
+
+
+def _write(path: Path, text: str) -> None:
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+def _summary(line: Line) -> dict[str, Any]:
+    overall, difference = line.overall(), line.overall_differences()
+    return {
+        "row": line.name,
+        "seeds": list(line.values),
+        "overall": overall.round(4).tolist(),
+        "difference": difference.round(4).tolist(),
+        "verdict": line.verdict(),
+        "ratios": line.cells().mean(0).round(4).tolist(),
+    }
+
+
+def _csv(table: Table) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["row", "seed", "told", "colons", "metric", "error", "closed_form", "ratio"])
+    for r in table.results:
+        for told, sets in r.errors.items():
+            for name, errors in sets.items():
+                for key in METRICS:
+                    mine, closed = errors[key], r.closed_form[name][key]
+                    writer.writerow(
+                        [r.row, r.seed, told, name, key, f"{mine:.6g}", f"{closed:.6g}", f"{mine / closed:.4f}"]
+                    )
+    return text.getvalue()
+
+
+def markdown(table: Table) -> str:
+    found = lines(table)
+    parts = [_head(table), _overall_table(found), _says(found, table), _closed_form(table)]
+    for i, colons in enumerate(table.judged):
+        parts.append(_set_table(colons, i, found))
+    parts += [_curves(table), _failures(table)]
+    return "\n".join(part for part in parts if part)
+
+
+def _head(table: Table) -> str:
+    seeds = sorted({r.seed for r in table.results})
+    tube, (width, height) = table.tube, table.size
+    trained = ", ".join(_span(colon_seeds(tube, seed)[0]) for seed in seeds)
+    judged = "; ".join(f"{c.name}: {_span(c.seeds)}, {c.frames} frames each" for c in table.judged)
+    steps = next(r.steps for r in table.results)
+    minutes = sum(r.seconds for r in table.results) / 60
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    revision = git_revision() or "unknown"
+    return f"""# What each ingredient of `{table.title}` is worth
+
+Made by `{command}`
+(program of revision {revision}); not to be edited. The trainings took {minutes:.0f} min.
+
+Every row is the first one with one change, trained anew with seeds {", ".join(map(str, seeds))}:
+{tube.scenes} {tube.family} colons (seeds {trained}),
+{tube.frames} frames each, {width}x{height} pixels, {steps} steps of {table.batch_size} frames unless the row says
+otherwise. The rows of a seed share colons and order. Judged on colons that no row saw
+({judged}),
+depth along the axis, one median scale per frame, ray_z > .15, depth < 100 mm, inside the mask.
+
+Numbers are **ratios to the errors of the blurred closed form** on the same frames (1: as good as one line of algebra):
+mean over the seeds (least to greatest). Overall: the geometric mean of AbsRel, RMSE and MedAE over all judged colons.
+Differences are to the first row, seed by seed; bold where their mean is larger than their spread (greatest minus least)
+over the seeds. That is a rule of thumb: by chance alone about one in ten would be bold. Images are small and training
+is short: these are directions and sizes of effects, not records.
+"""
+
+
+def _span(seeds: range) -> str:
+    return f"{seeds[0]}-{seeds[-1]}" if len(seeds) > 1 else str(seeds[0])
+
+
+def _number(value: float, signed: bool = False) -> str:
+    text = f"{value:+.3f}" if signed else f"{value:.3f}"
+    return text.replace("0.", ".", 1) if abs(value) < 1 else text
+
+
+def _spread(values: np.ndarray) -> str:
+    mean = _number(float(values.mean()))
+    return mean if len(values) == 1 else f"{mean} ({_number(float(values.min()))}-{_number(float(values.max()))})"
+
+
+def _difference(values: np.ndarray) -> str:
+    text = _number(float(values.mean()), signed=True)
+    return f"**{text}**" if clear(values) else text
+
+
+def _overall_table(found: Sequence[Line]) -> str:
+    text = ["## All together", "", "| row | what is different | overall | difference | |", "|---|---|---|---|---|"]
+    for i, line in enumerate(found):
+        difference, verdict = ("", "") if i == 0 else (_difference(line.overall_differences()), line.verdict())
+        text.append(f"| {line.name} | {line.row.change} | {_spread(line.overall())} | {difference} | {verdict} |")
+    return "\n".join([*text, ""])
+
+
+def _says(found: Sequence[Line], table: Table) -> str:
+    """Which ingredients earn their place and which do not, by the rule of the table."""
+
+    def named(part: str, *verdicts: str) -> str:
+        chosen = [line for line in found[1:] if line.row.part == part and line.verdict() in verdicts]
+        chosen.sort(key=lambda line: -abs(line.overall_differences().mean()))
+        shown = [f"{line.name} ({_number(line.overall_differences().mean(), signed=True)})" for line in chosen]
+        return "; ".join(shown) or "none"
+
+    return f"""## What it says
+
+- Leaving out costs clearly, so these earn their place: {named("dropped", "worse")}.
+- Did not help: leaving out makes no clear difference: {named("dropped", "no clear difference")}.
+- Did harm here: clearly better without: {named("dropped", "better")}.
+- In place of what the base has, clearly better: {named("instead", "better")}.
+- In place of what the base has, clearly worse: {named("instead", "worse")}.
+- In place of what the base has, no clear difference: {named("instead", "no clear difference")}.
+- To compare with: {named("reference", "better", "worse", "no clear difference", "one seed")}.
+"""
+
+
+def _closed_form(table: Table) -> str:
+    text = ["## The closed form's own errors", "", "| colons | AbsRel | RMSE mm | MedAE mm |", "|---|---|---|---|"]
+    for name, errors in table.results[0].closed_form.items():
+        text.append(f"| {name} | {errors['abs_rel']:.4f} | {errors['rmse_mm']:.2f} | {errors['medae_mm']:.2f} |")
+    return "\n".join([*text, ""])
+
+
+def _set_table(colons: JudgedColons, index: int, found: Sequence[Line]) -> str:
+    header = " | ".join(f"{name} | difference" for name in METRICS.values())
+    text = [f"## Judged on {colons.name}", "", f"| row | {header} |", "|---|" + "---|---|" * len(METRICS)]
+    for i, line in enumerate(found):
+        values, differences = line.cells()[:, index], line.differences()[:, index]
+        cells = [
+            f"{_spread(values[:, k])} | {_difference(differences[:, k]) if i else ''}" for k in range(len(METRICS))
+        ]
+        text.append(f"| {line.name} | {' | '.join(cells)} |")
+    return "\n".join([*text, ""])
+
+
+def _curves(table: Table) -> str:
+    shown = [r for r in table.results if any(row.curve and row.name == r.row for row in table.rows) and r.curve]
+    if not shown:
+        return ""
+    text = [
+        "## Has it converged?",
+        "",
+        "Validation loss without truth, each row's own (not to be compared between rows):",
+        "",
+    ]
+    text += ["| row | seed | steps: loss | change over the last third |", "|---|---|---|---|"]
+    for r in shown:
+        chosen = [r.curve[i] for i in np.unique(np.linspace(0, len(r.curve) - 1, _SHOWN_POINTS).round().astype(int))]
+        before = next(
+            loss for step, loss in reversed(r.curve) if 3 * step <= 2 * r.curve[-1][0] or step == r.curve[0][0]
+        )
+        change = 100 * (r.curve[-1][1] / before - 1)
+        curve = ", ".join(f"{step}: {loss:.4g}" for step, loss in chosen)
+        text.append(f"| {r.row} | {r.seed} | {curve} | {change:+.1f} % |")
+    return "\n".join([*text, ""])
+
+
+def _failures(table: Table) -> str:
+    failed = [f"- {r.row}, seed {r.seed}: {r.failed}" for r in table.results if r.failed]
+    return "\n".join(["## Failed", "", *failed, ""]) if failed else ""
