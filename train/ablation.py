@@ -24,11 +24,12 @@ from argparse import ArgumentError
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import lightning.pytorch as pl
 import torch
 import yaml
+from jsonargparse import ArgumentParser, Namespace
 
 from lightdepth.checkpoint import load_model
 from lightdepth.decline import log_closed_form
@@ -49,9 +50,6 @@ from .cli import as_yaml, training_parser
 from .datamodule import FrameDataModule, TubeData, collate, colon_seeds, tube_scene, with_reflectance
 from .fit import fit
 from .running import quiet
-
-if TYPE_CHECKING:
-    from jsonargparse import ArgumentParser, Namespace
 
 FARTHEST_MM = 100.0
 WRONG_BY = 0.3
@@ -222,13 +220,15 @@ def _plans(
     seeds: Sequence[int],
 ) -> list[_Plan]:
     """Every row of every seed, checked before the first of them is trained."""
-    plans = []
+    plans, defaults = [], parser.get_defaults()
     for row in rows:
         where = f"row {row.name!r}"
         values = _read(base)
         if row.preset is not None:
             values["model"] = _read(row.preset).get("model", {})
         for dotted, value in {**common, **(row.settings or {})}.items():
+            if isinstance(defaults.get(dotted), Namespace) and not isinstance(value, dict):
+                raise InputError(f"{where}: {dotted} is a group of options; give one of them, as {dotted}.NAME")
             _set(values, dotted, value, where)
         for seed in row.seeds or seeds:
             folder = output / f"seed_{seed}" / row.file
@@ -264,8 +264,6 @@ def _set(values: dict[str, Any], dotted: str, value: Any, where: str) -> None:
         values = values.setdefault(group, {})
         if not isinstance(values, dict):
             raise InputError(f"{where}: {dotted}: {group} is an option, not a group of them")
-    if isinstance(values.get(last), dict) and not isinstance(value, dict):
-        raise InputError(f"{where}: {dotted} is a group of options; expected one of them, such as {dotted}.NAME")
     values[last] = copy.deepcopy(value)
 
 
@@ -314,6 +312,7 @@ def _trained(parser: ArgumentParser, plan: _Plan, judge: Judge, rendered: list[F
             fit(made.model, made.data, folder, options, text, plan.seed, overwrite=True, settings=made.fit)
         model = load_model(folder / "model.safetensors", details=False)
         assert isinstance(model, NetworkModel)
+        model.to("cpu")  # where the colons to judge on are
         for told in plan.row.told:
             errors[told] = judge(model.network, made.model.loss_config, told)
         if not all(math.isfinite(v) for sets in errors.values() for found in sets.values() for v in found.values()):
