@@ -13,12 +13,25 @@ import numpy as np
 from densify.alignment import AlignmentConfig
 from densify.doctor import examine
 from densify.fusion import FusionConfig
-from densify.judge import judge_depth, judge_gap, judge_maps, read_run, write_metrics
+from densify.judge import (
+    THRESHOLDS_MM,
+    Evaluation,
+    dense_models,
+    in_mm,
+    judge_depth,
+    judge_gap,
+    judge_maps,
+    read_models,
+    read_run,
+    read_truth,
+    withheld_errors,
+)
 from densify.page import Gallery, densify_page
 from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, fitted_to_frames
 from densify.pipeline import densify as densify_maps
 from densify.rectify import RectifyConfig
 from densify.sfm import SfmConfig, sparse_map_from_frames
+from densify.tables import write_evaluations
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.commands import write_synthetic
 from lightdepth.datasets import FrameSequence, open_sequence
@@ -139,43 +152,68 @@ def evaluate(
     truth: Path | None = None,
     output: Path | None = None,
     join: Path | None = None,
+    trajectory: Path | None = None,
+    truth_mesh: Path | None = None,
+    mm_per_unit: float | None = None,
+    thresholds_mm: tuple[float, ...] = THRESHOLDS_MM,
+    max_depth_mm: float = 100.0,
+    common: bool = False,
     format: str | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
-    max_depth_mm: float = 100.0,
+    overwrite: bool = False,
 ) -> None:
-    """Errors of a densify run or of predictions, against truth and between submaps.
+    """Errors of predictions, a densify run, a map or a trajectory, against truth and between submaps.
 
     Args:
-        run: folder made by densify or predict
-        truth: sequence with true depth, and for surfaces with true poses
+        run: folder made by densify or predict, a sparse map, or a trajectory (TUM, cam_traj_map)
+        truth: sequence with true depth, and for maps with true poses; left out, a densify run's withheld points judge
         output: folder for the metrics; evaluation/ in the run when left out
         join: JSON with the Sim(3) between two submaps (first, second, scale, rotation, translation): their gap
+        trajectory: every localised frame of the maps, in place of their keyframes
+        truth_mesh: true surface, mm, in the frame of the true poses; left out, C3VD's own or triangulated true depth
+        mm_per_unit: millimetres per map unit, where known: the error after SE(3) needs it
+        thresholds_mm: of precision, recall and F-score
+        max_depth_mm: true depth beyond this takes no part in the errors of depth
+        common: judge the frames that both sides have, where there are others
         format: the truth's: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found if left out
         camera: calibration file that wins over the truth's
         mask: image, white where tissue shows
-        max_depth_mm: true depth beyond this takes no part
+        overwrite: replace metrics made before (evaluation/ in a run is replaced without asking)
     """
-    if truth is None and join is None:
+    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    if not run.exists():
+        raise InputError(f"{run}: no such folder or file")
+    predictions = run.is_dir() and any(run.glob("*.npz"))
+    made_by_us = run.is_dir() and (predictions or any(run.glob("map_*")))
+    if output is None and not made_by_us:
+        raise InputError(f"{run}: not a folder of this program; add -o FOLDER for the metrics")
+    if mm_per_unit is not None and not mm_per_unit > 0:
+        raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
+    if not thresholds_mm or not all(t > 0 for t in thresholds_mm):
+        raise InputError(f"--thresholds-mm {list(thresholds_mm)}; expected positive distances in mm")
+    withheld = withheld_errors(run) if made_by_us and not predictions else []
+    if truth is None and join is None and not withheld:
         raise InputError(
-            "nothing to evaluate against: give --truth DATA, or --join FILE for the gap between two submaps"
+            "nothing to evaluate against: give --truth DATA, or --join FILE for the gap between two submaps (only a "
+            "densify run with withheld points has figures without either)"
         )
-    if not run.is_dir():
-        raise InputError(f"{run}: no such folder")
-    arguments = dict(locals())
-    sequence = open_sequence(truth, format, camera, None, mask) if truth is not None else None
-    predictions = any(run.glob("*.npz"))
-    result: dict[str, Any] = {"kind": "surface"}
-    if predictions and sequence is not None:
-        result = judge_depth(run, sequence, max_depth_mm)
-    else:
-        maps = read_run(run)
-        if sequence is not None:
-            result = judge_maps(maps, sequence)
-        if join is not None:
-            result["gap"] = judge_gap(maps, join)
-    with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite=output is None) as out:
-        out.log(write_metrics({**result, "run": str(run), "truth_folder": str(truth)}, out.folder))
+    found: dict[str, Evaluation] = {}
+    extra: dict[str, Any] = {"run": str(run), "truth_folder": truth and str(truth)}
+    if truth is not None:
+        sequence = open_sequence(truth, format, camera, None, mask)
+        if predictions:
+            found[truth.name] = judge_depth(run, sequence, max_depth_mm, common)
+        else:
+            models = read_models(run, trajectory)
+            unit = 1.0 if mm_per_unit is None and in_mm(run) else mm_per_unit
+            world = read_truth(sequence, truth_mesh, with_surface=any(m.clouds for m in models))
+            found[truth.name] = judge_maps(models, world, unit, thresholds_mm, common)
+    if join is not None:
+        extra["gap"] = judge_gap(read_run(run), join)
+    with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite or output is None) as out:
+        out.hash_input("truth", truth)
+        out.log(write_evaluations(found, out.folder, withheld, extra))
 
 
 def demo(
@@ -215,15 +253,15 @@ def demo(
         sparse_map = read_map(run.folder / "data" / "slam")
         work = Densified.make(data, sparse_map, model, DensifyConfig(withhold=withhold, seed=seed))
         work.write(run, ("ply",), None)
-        evaluation = judge_maps(read_run(run.folder), data)
-        run.log(write_metrics(evaluation, run.folder))
-        run.record["evaluation"] = evaluation["maps"]
+        evaluation = judge_maps(dense_models(read_run(run.folder)), read_truth(data))
+        run.log(write_evaluations({"demo": evaluation}, run.folder))
+        run.record["evaluation"] = evaluation.result["maps"]
         notes = [
             f"A synthetic colon (seed {seed}), {frames} frames, a simulated SLAM export of {len(sparse_map.submaps)} "
             f"submaps with {spurious:.0%} wrong points; depth by {work.model}. Truth is exact, so errors are errors.",
         ]
         page = densify_page(
-            "Demo: from frames to a dense surface", work.results, work.baselines, work.gallery, notes, evaluation
+            "Demo: from frames to a dense surface", work.results, work.baselines, work.gallery, notes, evaluation.result
         )
         page.write(run.folder / "report.html")
         run.log(f"{output}/report.html")

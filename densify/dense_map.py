@@ -39,6 +39,13 @@ class Surface:
         rays = np.concatenate([np.broadcast_to(origins, directions.shape), directions], -1).astype(np.float32)
         return self._scene.cast_rays(self._core.Tensor(rays))["t_hit"].numpy().astype(np.float64)
 
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance (n,) from points (n, 3) to the closest of the surface, in single precision; infinite without any."""
+        if self._scene is None or not len(points):
+            return np.full(len(points), np.inf)
+        found = self._scene.compute_distance(self._core.Tensor(points.astype(np.float32)))
+        return found.numpy().astype(np.float64)
+
 
 @dataclass(frozen=True)
 class DenseMap:

@@ -1,14 +1,16 @@
-"""Errors against truth: trajectory (RMS ATE), surface accuracy, depth per frame; and the gap between two surfaces.
+"""Errors against truth: trajectory (ATE), surface (accuracy, completeness), depth per frame; the gap of two surfaces.
 
 After the densification paper: the Sim(3) that minimises the ATE between map and true camera centres carries the map to
 millimetres; accuracy is the distance from each point of a model to its closest point of the true cloud, which is made
-by unprojecting true distance at true poses. RMS and median (MedA) in mm.
+by unprojecting true distance at true poses. RMS and median (MedA) in mm. Completeness is the way back: from each point
+of the true cloud, one in each small cube, to the model's closest point.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,9 @@ from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.geometry import depth_from_distance
 from lightdepth.prediction import DepthPrediction
+
+CUBE_MM = 0.2
+"""The true cloud keeps one point in each cube of this size."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +38,8 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.translation
 
 
-def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """The Sim(3) with the least squared error from source to target points (n, 3) (Umeyama 1991).
+def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> Similarity:
+    """The Sim(3), or SE(3), with the least squared error from source to target points (n, 3) (Umeyama 1991).
 
     Raises InputError when the points cannot fix it: fewer than three, or all on a line.
     """
@@ -48,77 +53,237 @@ def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     u, d, vt = np.linalg.svd(t.T @ s / len(s))
     sign = np.array([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt
-    scale = float((d * sign).sum() / (s**2).sum() * len(s))
+    scale = float((d * sign).sum() / (s**2).sum() * len(s)) if with_scale else 1.0
+    if not scale > 0:
+        raise InputError("the map's camera centres and the true ones have nothing in common: the best scale is 0")
     return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
+
+
+def ate(source: np.ndarray, target: np.ndarray, similarity: Similarity) -> np.ndarray:
+    """Distance (n,) of camera centres (n, 3) after alignment."""
+    return np.linalg.norm(similarity.apply(source) - target, axis=1)
 
 
 def rms_ate(source: np.ndarray, target: np.ndarray, similarity: Similarity) -> float:
     """Root mean square distance of camera centres (n, 3) after alignment."""
-    return float(np.sqrt(((similarity.apply(source) - target) ** 2).sum(1).mean()))
+    return rms(ate(source, target, similarity))
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def sideways_agreement(source: np.ndarray, target: np.ndarray, similarity: Similarity) -> float:
+    """Correlation, at most 1, of the aligned centres (n, 3) with the true ones across the true line of travel.
+
+    Along a straight line of travel only noise is left across it. Then the Sim(3) may turn the map about the line by any
+    angle at the same ATE, and the distances of its surface are those of chance.
+    """
+    moved, true = similarity.apply(source), target - target.mean(0)
+    moved = moved - moved.mean(0)
+    line = np.linalg.svd(true, full_matrices=False)[2][0]
+    across = [points - np.outer(points @ line, line) for points in (moved, true)]
+    size = np.linalg.norm(across[0]) * np.linalg.norm(across[1])
+    return float((across[0] * across[1]).sum() / max(size, 1e-300))
+
+
+def closest(points: np.ndarray, tree: cKDTree) -> np.ndarray:
+    """Distance (n,) from each point (n, 3) to the closest point of the tree. Raises InputError without points."""
+    if not len(points):
+        raise InputError("the model has no points")
+    return tree.query(points, workers=-1)[0]
+
+
+def thinned(points: np.ndarray, cube: float) -> np.ndarray:
+    """One point in each cube of this size: the one closest to the cube's centre, in the order of the cubes.
+
+    It does not depend on the order of the points (n, 3), nor on how often one is among them.
+    """
+    if not len(points):
+        return points
+    cell = np.floor(points / cube)
+    if not np.abs(cell).max() < 1 << 20:  # three numbers of 21 bits make a key
+        raise InputError(f"the true surface reaches {np.abs(points).max() / 1000:.0f} m; are its poses in mm?")
+    off = np.square(points / cube - cell - 0.5).sum(1)
+    x, y, z = cell.astype(np.int64).T + (1 << 20)
+    key = (x << 42) | (y << 21) | z
+    order = np.lexsort((off, key))
+    first = np.concatenate([[True], np.diff(key[order]) > 0])
+    return points[order[first]]
 
 
 @dataclass(frozen=True)
-class Accuracy:
-    """Distance [mm] from each of `points` model points to the closest point of the true cloud."""
+class TrueSurface:
+    """The wall [mm] in the true world: a cloud (n, 3), with how it was sampled, and a mesh where there is one."""
 
-    points: int
-    rms_mm: float
-    median_mm: float
+    cloud: np.ndarray
+    sampling: str
+    mesh: Surface | None = None
+    mesh_source: str = ""
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        return cKDTree(self.cloud)
+
+    @cached_property
+    def spacing_mm(self) -> float:
+        """Median distance between neighbouring points of the cloud, of some thousand of them: no accuracy below about
+        half of it can be told from none."""
+        some = self.cloud[:: max(1, len(self.cloud) // 5000)]
+        return float(np.median(self.tree.query(some, k=2)[0][:, 1])) if len(self.cloud) > 1 else float("inf")
 
 
-def accuracy(model: np.ndarray, tree: cKDTree) -> Accuracy:
-    """Of model points (n, 3) [mm] against the true cloud. Raises InputError when there is no model."""
-    if not len(model):
-        raise InputError("the model has no points")
-    distance, _ = tree.query(model, workers=-1)
-    return Accuracy(len(model), float(np.sqrt((distance**2).mean())), float(np.median(distance)))
+def true_cloud(frames: Iterable[Frame], stride: int = 2, cube: float = CUBE_MM) -> np.ndarray:
+    """World points (n, 3) [mm] of every stride-th pixel of frames with true distance and pose, one in each cube.
 
-
-def true_cloud(frames: Iterable[Frame], stride: int = 2, max_points: int = 3_000_000) -> np.ndarray:
-    """World points (n, 3) [mm] of every stride-th pixel of frames with true distance and pose."""
-    clouds = []
+    Raises InputError when there is none."""
+    clouds, waiting = [np.zeros((0, 3))], 0
     for frame in frames:
-        if frame.true_distance is None or frame.true_world_from_cam is None:
-            continue
-        rays = frame.camera.rays()[0][::stride, ::stride]
-        distance = frame.true_distance[::stride, ::stride]
-        known = (distance > 0) & np.isfinite(distance) & frame.valid[::stride, ::stride]
-        points = rays[known] * distance[known, None]
-        pose = frame.true_world_from_cam
-        clouds.append(points @ pose[:3, :3].T + pose[:3, 3])
-    if not clouds or not sum(map(len, clouds)):
+        points, known = true_points(frame, stride)
+        clouds.append(thinned(points[known], cube))
+        waiting += len(clouds[-1])
+        if waiting > 5_000_000:  # neighbouring frames see the same wall: keep memory flat
+            clouds, waiting = [thinned(np.concatenate(clouds), cube)], 0
+    cloud = thinned(np.concatenate(clouds), cube)
+    if not len(cloud):
         raise InputError("no frame has both valid true distance and a true pose; there is no truth to compare with")
-    cloud = np.concatenate(clouds)
-    return cloud[:: -(-len(cloud) // max_points)]
+    return cloud
 
 
-def evaluate_map(
-    centers: np.ndarray, true_centers: np.ndarray, clouds: Mapping[str, np.ndarray], tree: cKDTree
-) -> dict[str, Any]:
-    """Trajectory and surface errors of one submap: camera centres (n, 3) in the map and in truth [mm], clouds of map
-    points by name ("sparse", "dense" ...), the true cloud as a tree. A cloud without points gives None."""
-    similarity = fit_similarity(centers, true_centers)
-    result: dict[str, Any] = {
-        "keyframes": len(centers),
-        "rms_ate_mm": rms_ate(centers, true_centers, similarity),
-        "mm_per_unit": similarity.scale,
+def true_points(frame: Frame, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """World points (h, w, 3) [mm] of every stride-th pixel each way, and which are known (h, w)."""
+    rays = frame.camera.rays()[0][::stride, ::stride]
+    if frame.true_distance is None or frame.true_world_from_cam is None:
+        return np.zeros(rays.shape), np.zeros(rays.shape[:2], bool)
+    check_numbers(frame)
+    distance = frame.true_distance[::stride, ::stride].astype(np.float64)
+    known = (distance > 0) & frame.valid[::stride, ::stride]
+    pose = frame.true_world_from_cam
+    points = rays * np.where(known, distance, 0)[..., None]
+    return points @ pose[:3, :3].T + pose[:3, 3], known
+
+
+def depth_triangles(frame: Frame, stride: int, jump: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+    """What a frame's true distance shows as a mesh: vertices (n, 3) [mm] and triangles (m, 3), without those whose
+    corners' distances from the camera differ by more than `jump` of the least: they would span folds."""
+    points, known = true_points(frame, stride)
+    height, width = known.shape
+    index = np.arange(height * width).reshape(height, width)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    triangles = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, c, b), (b, c, d))])
+    if frame.true_distance is None:
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    distance = frame.true_distance[::stride, ::stride].ravel()[triangles]
+    whole = known.ravel()[triangles].all(1)
+    triangles = triangles[whole & (distance.max(1) <= (1 + jump) * distance.min(1))]
+    used, flat = np.unique(triangles, return_inverse=True)
+    return points.reshape(-1, 3)[used], flat.reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class SurfaceErrors:
+    """Distances [mm]: from each model point to the closest true point, to the true mesh where there is one, and from
+    each true point to the closest model point. All (n,) of their own length."""
+
+    accuracy: np.ndarray
+    to_mesh: np.ndarray | None
+    completeness: np.ndarray
+
+    def summary(self, thresholds_mm: Sequence[float]) -> dict[str, Any]:
+        """Figures for the report. Precision, recall: shares of model and true points within each threshold."""
+        found: dict[str, Any] = {"points": len(self.accuracy), **_figures(self.accuracy)}
+        found["to_mesh"] = None if self.to_mesh is None else _figures(self.to_mesh)
+        found["completeness"] = _figures(self.completeness)
+        for name, distance in (("precision", self.accuracy), ("recall", self.completeness)):
+            found[name] = {f"{t:g}mm": float((distance <= t).mean()) for t in thresholds_mm}
+        found["f_score"] = {
+            key: 2 * p * r / (p + r) if p + r else 0.0
+            for key, p, r in zip(found["precision"], found["precision"].values(), found["recall"].values(), strict=True)
+        }
+        return found
+
+
+def _figures(distance: np.ndarray) -> dict[str, float]:
+    return {
+        "rms_mm": rms(distance),
+        "median_mm": float(np.median(distance)),
+        "p90_mm": float(np.quantile(distance, 0.9)),
     }
-    for name, cloud in clouds.items():
-        result[name] = asdict(accuracy(similarity.apply(cloud), tree)) if len(cloud) else None
-    return result
 
 
-def evaluate_depth(
-    prediction: DepthPrediction, frame: Frame, max_depth_mm: float = 100.0, alignment: str = "median"
-) -> dict[str, float]:
-    """Depth errors [mm] of one frame, over pixels valid in truth, prediction and mask with 0 < depth < max_depth_mm.
+def surface_errors(model: np.ndarray, truth: TrueSurface) -> SurfaceErrors:
+    """Of model points (n, 3) [mm]. Raises InputError when there are none."""
+    return SurfaceErrors(
+        accuracy=closest(model, truth.tree),
+        to_mesh=None if truth.mesh is None else truth.mesh.distance(model),
+        completeness=closest(truth.cloud, cKDTree(model)),
+    )
 
-    Raises InputError when no pixel of the truth is valid.
-    """
-    import torch
 
-    from lightdepth.metrics import depth_errors  # brings torchmetrics, which takes seconds to import
+def pooled(errors: Sequence[SurfaceErrors]) -> SurfaceErrors:
+    """Of the models together: all of their points, and for each true point the closest of any."""
+    meshes = [e.to_mesh for e in errors if e.to_mesh is not None]
+    return SurfaceErrors(
+        np.concatenate([e.accuracy for e in errors]),
+        np.concatenate(meshes) if meshes else None,
+        np.min([e.completeness for e in errors], 0),
+    )
 
+
+@dataclass(frozen=True)
+class ComparedDepth:
+    """One frame's predicted and true depth (H, W) [mm, unless the prediction is up to scale], where both are to be
+    compared (H, W), and the share of the image and of the valid truth that these pixels are."""
+
+    predicted: np.ndarray
+    truth: np.ndarray
+    valid: np.ndarray
+    share_of_image: float
+    share_of_truth: float
+
+    def errors(self, alignments: Iterable[str]) -> dict[str, float]:
+        """Every error of lightdepth.metrics under every alignment, by NAME_ALIGNMENT."""
+        import torch
+
+        from lightdepth.metrics import depth_errors  # brings torchmetrics, which takes seconds to import
+
+        p, q, v = (torch.from_numpy(np.ascontiguousarray(a)) for a in (self.predicted, self.truth, self.valid))
+        found = {}
+        for alignment in alignments:
+            errors = depth_errors(p, q, v, alignment)
+            assert errors is not None
+            found |= {f"{name}_{alignment}": float(value) for name, value in errors.items()}
+        return found
+
+    def within(self, edges_mm: np.ndarray, alignment: str) -> np.ndarray:
+        """Share of the pixels with |p - q| of at most each edge (k,), after alignment."""
+        import torch
+
+        from lightdepth.metrics import aligned, compared
+
+        p, q = compared(*(torch.from_numpy(np.ascontiguousarray(a)) for a in (self.predicted, self.truth, self.valid)))
+        error = np.sort((aligned(p, q, alignment) - q).abs().numpy())
+        return np.searchsorted(error, edges_mm, "right") / len(error)
+
+
+def check_numbers(frame: Frame) -> None:
+    """Raises InputError where the true distance is no number: readers give 0 for what is unknown."""
+    bad = 0 if frame.true_distance is None else int((~np.isfinite(frame.true_distance)).sum())
+    if bad:
+        raise InputError(f"{frame.name}: the true depth is NaN or infinite at {bad} pixels; expected 0 where unknown")
+
+
+def true_depth(frame: Frame, max_depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W) [mm] along the axis, and where it is known, in the mask and within (0, max_depth_mm) (H, W)."""
+    assert frame.true_distance is not None
+    check_numbers(frame)
+    truth = depth_from_distance(frame.true_distance, frame.camera.rays()[0][..., 2])
+    return truth, frame.valid & (truth > 0) & (truth < max_depth_mm)
+
+
+def compare_depth(prediction: DepthPrediction, frame: Frame, max_depth_mm: float = 100.0) -> ComparedDepth:
+    """A prediction against its frame's truth. Raises InputError where sizes differ, there is no truth to compare with,
+    or the prediction has no number at a pixel that it calls valid."""
     if frame.true_distance is None:
         raise InputError(f"{frame.name}: no true depth")
     if frame.true_distance.shape != prediction.distance.shape:
@@ -127,19 +292,32 @@ def evaluate_depth(
             f"{frame.name}: the prediction is {w}x{h}, the truth {frame.camera.width}x{frame.camera.height}; "
             "predict at the size of the truth"
         )
-    ray_z = frame.camera.rays()[0][..., 2]
-    truth = depth_from_distance(frame.true_distance, ray_z)
-    valid = frame.valid & np.isfinite(truth) & (truth > 0) & (truth < max_depth_mm)
-    if not valid.any():
+    bad = int((prediction.valid & ~np.isfinite(prediction.distance)).sum())
+    if bad:
+        raise InputError(
+            f"{frame.name}: the predicted depth is NaN or infinite at {bad} pixels that are marked valid; expected "
+            "numbers there"
+        )
+    truth, known = true_depth(frame, max_depth_mm)
+    if not known.any():
         raise InputError(f"{frame.name}: the true depth is invalid everywhere (0, or at least {max_depth_mm:g} mm)")
-    common = valid & prediction.valid
-    predicted = depth_from_distance(prediction.distance, ray_z)
-    p, q, v = (torch.from_numpy(np.ascontiguousarray(a)) for a in (predicted, truth, common))
-    errors = depth_errors(p, q, v, alignment)
-    if errors is None:
+    predicted = depth_from_distance(prediction.distance, frame.camera.rays()[0][..., 2])
+    common = known & prediction.valid & (predicted > 0)
+    if not common.any():
         raise InputError(f"{frame.name}: the prediction is valid nowhere where the truth is")
-    values = {f"{name}_{alignment}": float(value) for name, value in errors.items()}
-    return {**values, "pixels": int(common.sum()), "share_of_truth": float(common.sum() / valid.sum())}
+    return ComparedDepth(predicted, truth, common, float(common.mean()), float(common.sum() / known.sum()))
+
+
+def evaluate_depth(
+    prediction: DepthPrediction, frame: Frame, max_depth_mm: float = 100.0, alignments: Iterable[str] | None = None
+) -> dict[str, float]:
+    """Depth errors [mm] of one frame, over pixels valid in truth, prediction and mask with 0 < depth < max_depth_mm,
+    under all alignments where none are chosen. Raises InputError as `compare_depth` does."""
+    from lightdepth.metrics import ALIGNMENTS
+
+    found = compare_depth(prediction, frame, max_depth_mm)
+    counts = {"pixels": int(found.valid.sum()), "share_of_image": found.share_of_image}
+    return {**found.errors(alignments or ALIGNMENTS), **counts, "share_of_truth": found.share_of_truth}
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,7 @@ def test_a_run_has_a_surface_for_every_map_a_report_and_its_figures(run):
 def test_evaluate_writes_the_tables_into_the_run_and_again_without_asking(run, data, capsys):
     assert lightdepth("evaluate", run, "--truth", data) == 0
     shown = capsys.readouterr().out
-    for name in ("metrics.json", "metrics.md", "metrics.csv", "run.json"):
+    for name in ("metrics.json", "metrics.md", "metrics.csv", "metrics.tex", "map_000_error.ply", "run.json"):
         assert (run / "evaluation" / name).is_file()
     assert (run / "evaluation" / "metrics.md").read_text() in shown
     rows = json.loads((run / "evaluation" / "metrics.json").read_text())["maps"]
@@ -179,9 +179,22 @@ def test_evaluate_judges_the_gap_between_two_maps_by_the_known_similarities(run,
     assert not (tmp_path / "gap2").exists()
 
 
-def test_evaluate_without_anything_to_compare_with_is_refused(run, capsys):
-    assert lightdepth("evaluate", run) == 3
+def test_evaluate_without_truth_shows_the_withheld_points_beside_a_constant_distance(run, tmp_path, capsys):
+    assert lightdepth("evaluate", run, "-o", tmp_path / "e") == 0
+    record = json.loads((tmp_path / "e" / "metrics.json").read_text())
+    maps = json.loads((run / "run.json").read_text())["maps"]
+    assert [w["withheld"]["median"] for w in record["withheld"]] == [m["withheld"]["median"] for m in maps]
+    text = (tmp_path / "e" / "metrics.md").read_text()
+    assert "no truth needed" in text and text.count("constant distance") == len(maps)
+    assert text in capsys.readouterr().out
+
+
+def test_evaluate_without_anything_to_compare_with_is_refused(data, run, tmp_path, capsys):
+    shutil.copytree(run / "map_000", tmp_path / "alone" / "map_000")
+    assert lightdepth("evaluate", tmp_path / "alone") == 3
     assert "give --truth DATA, or --join FILE" in capsys.readouterr().err
+    assert lightdepth("evaluate", data / "slam", "--truth", data) == 3
+    assert "not a folder of this program; add -o FOLDER" in capsys.readouterr().err
 
 
 def test_a_map_s_known_scale_gives_millimetres_and_other_formats_on_request(run, data, tmp_path):

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from densify.alignment import Alignment
 from densify.dense_map import DenseMap
-from densify.evaluation import evaluate_map, true_cloud
+from densify.evaluation import closest, fit_similarity, true_cloud
 from densify.fusion import FusionConfig
 from densify.pipeline import (
     DensifyConfig,
@@ -277,13 +277,10 @@ def rms(seed: int, spurious: float, voxel_mm: float) -> dict[str, float]:
     dense = densify(sequence(rendered.frames), found.map, DeclineModel(details=False), config)[0].dense
     true = {f.number: f.true_world_from_cam[:3, 3] for f in rendered.frames}
     keyframes = dense.submap.keyframes
-    judged = evaluate_map(
-        np.stack([k.center for k in keyframes]),
-        np.stack([true[k.number] for k in keyframes]),
-        {"sparse": dense.submap.points, "dense": dense.vertices},
-        judge_tree(seed),
-    )
-    return {name: judged[name]["rms_mm"] for name in ("sparse", "dense")}
+    similarity = fit_similarity(np.stack([k.center for k in keyframes]), np.stack([true[k.number] for k in keyframes]))
+    clouds = {"sparse": dense.submap.points, "dense": dense.vertices}
+    errors = {name: closest(similarity.apply(cloud), judge_tree(seed)) for name, cloud in clouds.items()}
+    return {name: float(np.sqrt(np.mean(e**2))) for name, e in errors.items()}
 
 
 def test_thirty_percent_of_wrong_points_spoil_the_sparse_map_but_not_the_dense_one():

@@ -11,6 +11,7 @@ of reference and scale.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,7 @@ from lightdepth.sparse_map import SparseMap, Submap
 
 MAPS = "3D_maps"
 TRAJECTORIES = "camera_trajectory"
+TRAJECTORY_FILE = re.compile(r"cam_traj_map_(\d+)\.txt")
 _TRAJECTORY_HEADER = (
     "# timestamp, name_image, tx, ty, tz, qw, qx, qy, qz, frame_state(0:frame; 1:is_kf; 2:was_kf), "
     "track_state (0:normal; 1:reloc; 2:loop; 3:merge), dataset_id, merged_frame_id"
