@@ -16,14 +16,18 @@ from densify.fusion import FusionConfig
 from densify.judge import (
     THRESHOLDS_MM,
     Evaluation,
+    Model,
     dense_models,
     in_mm,
+    is_made_by_us,
     judge_depth,
     judge_gap,
     judge_maps,
     read_models,
     read_run,
     read_truth,
+    sparse_models,
+    with_trajectories,
     withheld_errors,
 )
 from densify.page import Gallery, densify_page
@@ -31,7 +35,9 @@ from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, fitted_t
 from densify.pipeline import densify as densify_maps
 from densify.rectify import RectifyConfig
 from densify.sfm import SfmConfig, sparse_map_from_frames
+from densify.suite import present, read_suite
 from densify.tables import write_evaluations
+from densify.trajectory import read_trajectories, trajectory_files
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.commands import write_synthetic
 from lightdepth.datasets import FrameSequence, open_sequence
@@ -152,6 +158,8 @@ def evaluate(
     truth: Path | None = None,
     output: Path | None = None,
     join: Path | None = None,
+    suite: Path | None = None,
+    checkpoint: str | None = None,
     trajectory: Path | None = None,
     truth_mesh: Path | None = None,
     mm_per_unit: float | None = None,
@@ -170,6 +178,8 @@ def evaluate(
         truth: sequence with true depth, and for maps with true poses; left out, a densify run's withheld points judge
         output: folder for the metrics; evaluation/ in the run when left out
         join: JSON with the Sim(3) between two submaps (first, second, scale, rotation, translation): their gap
+        suite: YAML naming the sequences below run and truth that stand in one table (configs/bench/c3vd.yaml)
+        checkpoint: sparse maps are made dense with it first, and the surfaces written: a path, a bundled name, decline
         trajectory: every localised frame of the maps, in place of their keyframes
         truth_mesh: true surface, mm, in the frame of the true poses; left out, C3VD's own or triangulated true depth
         mm_per_unit: millimetres per map unit, where known: the error after SE(3) needs it
@@ -184,36 +194,84 @@ def evaluate(
     arguments = {k: v for k, v in locals().items() if k != "overwrite"}
     if not run.exists():
         raise InputError(f"{run}: no such folder or file")
-    predictions = run.is_dir() and any(run.glob("*.npz"))
-    made_by_us = run.is_dir() and (predictions or any(run.glob("map_*")))
-    if output is None and not made_by_us:
+    if output is None and not is_made_by_us(run):
         raise InputError(f"{run}: not a folder of this program; add -o FOLDER for the metrics")
     if mm_per_unit is not None and not mm_per_unit > 0:
         raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
     if not thresholds_mm or not all(t > 0 for t in thresholds_mm):
         raise InputError(f"--thresholds-mm {list(thresholds_mm)}; expected positive distances in mm")
-    withheld = withheld_errors(run) if made_by_us and not predictions else []
-    if truth is None and join is None and not withheld:
+    if truth is None and join is None and not withheld_errors(run):
         raise InputError(
             "nothing to evaluate against: give --truth DATA, or --join FILE for the gap between two submaps (only a "
             "densify run with withheld points has figures without either)"
         )
+    if suite is not None and (truth is None or trajectory or truth_mesh or join):
+        raise InputError("--suite needs --truth, and goes with neither --trajectory, --truth-mesh nor --join")
+    columns, missing = None, {}
+    pairs = {truth.name: (run, truth)} if truth is not None else {}
+    if suite is not None and truth is not None:
+        columns = read_suite(suite)
+        pairs, missing = present(columns, run, truth)
+    model = None if checkpoint is None else load_model(checkpoint, details=False)
     found: dict[str, Evaluation] = {}
+    withheld = [] if columns else withheld_errors(run)
     extra: dict[str, Any] = {"run": str(run), "truth_folder": truth and str(truth)}
-    if truth is not None:
-        sequence = open_sequence(truth, format, camera, None, mask)
-        if predictions:
-            found[truth.name] = judge_depth(run, sequence, max_depth_mm, common)
-        else:
-            models = read_models(run, trajectory)
-            unit = 1.0 if mm_per_unit is None and in_mm(run) else mm_per_unit
-            world = read_truth(sequence, truth_mesh, with_surface=any(m.clouds for m in models))
-            found[truth.name] = judge_maps(models, world, unit, thresholds_mm, common)
     if join is not None:
         extra["gap"] = judge_gap(read_run(run), join)
     with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite or output is None) as out:
         out.hash_input("truth", truth)
-        out.log(write_evaluations(found, out.folder, withheld, extra))
+        for column, reason in missing.items():
+            out.fail(column, reason)
+        for name, (source, folder) in pairs.items():
+            try:
+                if source.is_dir() and any(source.glob("*.npz")):
+                    sequence = open_sequence(folder, format, camera, None, mask)
+                    found[name] = judge_depth(source, sequence, max_depth_mm, common)
+                    continue
+                if model is None or any(source.glob("map_*")) or source.is_file():
+                    sequence, models = (
+                        open_sequence(folder, format, camera, None, mask),
+                        read_models(source, trajectory),
+                    )
+                    points = withheld_errors(source) if columns else []
+                else:
+                    sparse_map, sequence = _map_and_frames(out, folder, source, format, camera, None, mask, SfmConfig())
+                    where = out.folder / name if columns else out.folder
+                    models, points = _made_dense(sequence, sparse_map, model, where)
+                    poses = trajectory or (source if trajectory_files(source) else None)
+                    models = with_trajectories(models, read_trajectories(poses)) if poses else models
+                withheld += [{**entry, "sequence": name} for entry in points] if columns else points
+                world = read_truth(sequence, truth_mesh, with_surface=any(m.clouds for m in models))
+                if columns and columns.fps:
+                    world = replace(world, period=1 / columns.fps)
+                unit = 1.0 if mm_per_unit is None and in_mm(source) else mm_per_unit
+                found[name] = judge_maps(models, world, unit, thresholds_mm, common)
+            except InputError as error:
+                if columns is None:
+                    raise
+                out.fail(name, str(error))
+        if columns and not found:
+            raise InputError(f"no sequence could be judged; the first: {out.record['failures'][0]['reason']}")
+        out.log(write_evaluations(found, out.folder, withheld, extra, columns))
+
+
+def _made_dense(
+    frames: FrameSequence, sparse_map: SparseMap, model: DepthModel, folder: Path
+) -> tuple[list[Model], list[dict[str, Any]]]:
+    """The maps made dense as `densify` makes them, with its defaults, and written; maps of which no surface was made
+    keep their sparse points. And what is said of the withheld points, with the constant distance's."""
+    work = Densified.make(frames, sparse_map, model, DensifyConfig())
+    constant = {b.dense.submap.id: b.withheld for b in work.baselines}
+    withheld = []
+    for result in work.results:
+        if len(result.dense.triangles):
+            result.dense.write(folder / f"map_{result.dense.submap.id:03d}")
+        if result.withheld is not None:
+            baseline = constant.get(result.dense.submap.id)
+            both = {"withheld": result.withheld, "withheld_constant": baseline}
+            withheld.append(plain({"map": result.dense.submap.id, **both}))
+    dense = {m.trajectory.id: m for m in (dense_models(read_run(folder)) if any(folder.glob("map_*")) else [])}
+    return [dense.get(m.trajectory.id, m) for m in sparse_models(sparse_map)], withheld
 
 
 def demo(

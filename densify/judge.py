@@ -207,7 +207,7 @@ def dense_models(maps: Sequence[DenseMapFiles]) -> list[Model]:
     """Dense maps, with their keyframes as trajectories."""
     return [
         Model(
-            in_order(m.id, m.numbers.tolist(), m.map_from_cam[:, :3, 3], len(m.numbers), False),
+            in_order(m.id, m.numbers.tolist(), m.map_from_cam[:, :3, 3]),
             {"sparse": m.sparse, "sparse_inliers": m.sparse[m.sparse_inlier], "dense": m.vertices},
             m.triangles,
         )
@@ -355,7 +355,7 @@ def judge_maps(
     errors: dict[str, list[SurfaceErrors]] = {name: [] for name in _CLOUDS}
     meshes = []
     for m in models:
-        row: dict[str, Any] = {"map": m.trajectory.id, "keyframes": m.trajectory.keyframes}
+        row: dict[str, Any] = {"map": m.trajectory.id, "keyframes": int(m.trajectory.keyframe.sum())}
         rows.append(row)
         try:
             found = align_trajectory(m.trajectory, truth.poses, mm_per_unit)
@@ -424,6 +424,11 @@ def _ms_per_keyframe(truth: Truth, keyframes: int) -> float | None:
     if truth.period is None or not truth.period > 0 or not keyframes:
         return None
     return 1000 * truth.period * len(truth.numbers) / keyframes
+
+
+def is_made_by_us(path: Path) -> bool:
+    """Whether a folder holds predictions or a densify run, so that metrics may be written into it."""
+    return path.is_dir() and (any(path.glob("*.npz")) or any(path.glob("map_*")))
 
 
 def in_mm(folder: Path) -> bool:

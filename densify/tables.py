@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from densify.judge import EDGES_MM, ErrorMesh, Evaluation, with_versions
+from densify.suite import Suite, alone
 from lightdepth.figures import chart, chart_png, mesh_picture
 from lightdepth.report import number
 
@@ -95,11 +96,14 @@ def _tex(text: str) -> str:
     return text
 
 
-# One or several sequences: results by name.
+# One or several sequences: results by name, columns as a suite has them.
+
+Results = Mapping[str, Mapping[str, Any]]
 
 
-def trajectory_table(results: Mapping[str, Mapping[str, Any]]) -> Table:
-    """The paper's table 1, with the shares and the other alignments below it."""
+def trajectory_table(results: Results, suite: Suite | None = None) -> Table:
+    """The paper's table 1, with the shares and the other alignments below it, and published rows below those."""
+    suite = suite or alone(list(results))
     lines = {
         "# Frames": "frames",
         "# KF": "keyframes",
@@ -111,66 +115,64 @@ def trajectory_table(results: Mapping[str, Mapping[str, Any]]) -> Table:
         "# Submaps aligned": "submaps_aligned",
         "# Submaps": "submaps",
     }
-    rows = []
-    for title, key in lines.items():
-        values = [_trajectory_value(result, key) for result in results.values()]
-        rows.append([title, *_with_mean(values, whole=key in ("frames", "keyframes", "submaps", "submaps_aligned"))])
-    return Table("Table 1. Trajectory. ATE in mm, each submap after its own alignment.", _headers(results, 1), rows)
+    rows = [[title, *_row(results, suite.groups, _trajectory_figure(key))] for title, key in lines.items()]
+    rows += [[title, *values] for title, values in suite.trajectory.items()]
+    title = "Table 1. Trajectory. ATE in mm, each submap after its own alignment."
+    return Table(title, _headers(suite.groups, "Metrics"), rows)
 
 
-def _trajectory_value(result: Mapping[str, Any], key: str) -> Any:
-    value = result.get("trajectory", {}).get(key)
-    return 100 * value if key == "localised_share" and value is not None else value
+def _trajectory_figure(key: str) -> Callable[[Mapping[str, Any]], Any]:
+    def figure(result: Mapping[str, Any]) -> Any:
+        value = result["trajectory"].get(key)
+        return 100 * value if key == "localised_share" and value is not None else value
+
+    return figure
 
 
-def surface_table(
-    results: Mapping[str, Mapping[str, Any]],
-    published: Mapping[str, Mapping[str, Sequence[float | None]]] | None = None,
-) -> Table:
-    """The paper's table 2: model points, RMS and median accuracy; `published` rows by method and metric below ours."""
-    rows: list[list[Any]] = []
-    for key, name in MODELS.items():
-        found = [result.get("all", {}).get(key) for result in results.values()]
-        if not any(found):
-            continue
-        points = [None if f is None else f["points"] / 1000 for f in found]
-        rows.append([name, "#MP (×10³)", *_with_mean(points)])
-        for title, figure in (("RMS Acc.", "rms_mm"), ("MedA Acc.", "median_mm")):
-            rows.append([name, title, *_with_mean([None if f is None else f[figure] for f in found])])
-    for name, metrics in (published or {}).items():
-        rows += [[name, metric, *values] for metric, values in metrics.items()]
+def surface_table(results: Results, suite: Suite | None = None) -> Table:
+    """The paper's table 2: model points, RMS and median accuracy; published rows below ours."""
+    suite = suite or alone(list(results))
+    figures: dict[str, Callable[[Mapping[str, Any]], Any]] = {
+        "#MP (×10³)": lambda f: f["points"] / 1000,
+        "RMS Acc.": lambda f: f["rms_mm"],
+        "MedA Acc.": lambda f: f["median_mm"],
+    }
+    rows = _model_rows(results, suite, figures)
+    rows += [[method, metric, *values] for method, of in suite.surface.items() for metric, values in of.items()]
     title = "Table 2. Maps. Accuracy in mm, each model point to the closest true point."
-    return Table(title, _headers(results, 2), rows)
+    return Table(title, _headers(suite.surface_groups, "Method", "Metrics"), rows)
 
 
-def completeness_table(results: Mapping[str, Mapping[str, Any]]) -> Table:
+def completeness_table(results: Results, suite: Suite | None = None) -> Table:
     """What the paper's tables leave out: distance to the true mesh, completeness, F-score."""
+    suite = suite or alone(list(results))
+    figures: dict[str, Callable[[Mapping[str, Any]], Any]] = {}
+    for title, name in (("RMS", "rms_mm"), ("Median", "median_mm")):
+        figures[f"{title} to true mesh"] = lambda f, name=name: f["to_mesh"] and f["to_mesh"][name]
+        figures[f"{title} from truth (completeness)"] = lambda f, name=name: f["completeness"][name]
+    for result in results.values():
+        thresholds = [f"{t:g}mm" for t in result["thresholds_mm"]]
+    for what, title in (("precision", "Precision"), ("recall", "Recall"), ("f_score", "F-score")):
+        for t in thresholds:
+            figures[f"{title} {t}"] = lambda f, what=what, t=t: f[what][t]
+    title = "Table 3. Maps. Distances in mm; precision, recall: shares of model and true points within the threshold."
+    return Table(title, _headers(suite.surface_groups, "Method", "Metrics"), _model_rows(results, suite, figures))
+
+
+def _model_rows(
+    results: Results, suite: Suite, figures: Mapping[str, Callable[[Mapping[str, Any]], Any]]
+) -> list[list[Any]]:
     rows: list[list[Any]] = []
     for key, name in MODELS.items():
-        found = [result.get("all", {}).get(key) for result in results.values()]
-        if not any(found):
-            continue
-        thresholds = list(next(f for f in found if f)["f_score"])
-        columns: list[tuple[str, list[Any]]] = [
-            (
-                f"{title} to true mesh",
-                [None if f is None or f["to_mesh"] is None else f["to_mesh"][figure] for f in found],
-            )
-            for title, figure in (("RMS", "rms_mm"), ("Median", "median_mm"))
-        ]
-        columns += [
-            (f"{title} from truth (completeness)", [None if f is None else f["completeness"][figure] for f in found])
-            for title, figure in (("RMS", "rms_mm"), ("Median", "median_mm"))
-        ]
-        for what, title in (("precision", "Precision"), ("recall", "Recall"), ("f_score", "F-score")):
-            columns += [(f"{title} {t}", [None if f is None else f[what][t] for f in found]) for t in thresholds]
-        rows += [[name, title, *_with_mean(values)] for title, values in columns]
-    title = "Table 3. Maps. Distances in mm; precision, recall: shares of model and true points within the threshold."
-    return Table(title, _headers(results, 2), rows)
+        found = {column: result["all"][key] for column, result in results.items() if result["all"].get(key)}
+        if found:
+            rows += [[name, title, *_row(found, suite.surface_groups, figure)] for title, figure in figures.items()]
+    return rows
 
 
-def depth_table(results: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Depth errors under every alignment: mean over frames, and over sequences where there are several."""
+def depth_table(results: Results, suite: Suite | None = None) -> Table:
+    """Depth errors under every alignment: mean over frames, and over sequences where there are several; published rows
+    below."""
     rows: list[list[Any]] = []
     several = len(results) > 1
     for alignment in next(iter(results.values()))["alignment"]:
@@ -183,6 +185,8 @@ def depth_table(results: Mapping[str, Mapping[str, Any]]) -> Table:
             values = [[r["mean"][f"{key}_{alignment}"] for r in results.values()] for key in _METRICS]
             rows.append([label, "mean over sequences", *(float(np.mean(v)) for v in values)])
             rows.append([label, "mean over frames", *(float(np.average(v, weights=weights)) for v in values)])
+    for method, values in (suite.depth if suite else {}).items():
+        rows.append(["not stated", method, *(values.get(key) for key in _METRICS)])
     return Table("Depth errors. Mean over frames.", ["Alignment", "Sequence", *_METRICS.values()], rows)
 
 
@@ -194,24 +198,32 @@ def withheld_table(withheld: Sequence[Mapping[str, Any]]) -> Table:
             found = entry.get(key)
             if found:  # JSON has no infinity: nothing stands for it
                 shares = [float("inf") if found.get(k) is None else found[k] for k in ("median", "p90")]
-                rows.append([f"map {entry['map']}", name, found["points"], *shares, found["miss"]])
+                where = f"{entry['sequence']}, " if "sequence" in entry else ""
+                rows.append([f"{where}map {entry['map']}", name, found["points"], *shares, found["miss"]])
     title = "Withheld points of the sparse map: |surface - point| / point along the ray, no truth needed."
     return Table(title, ["Map", "Depth", "Points", "Median", "90th percentile", "Share that misses"], rows)
 
 
-def _headers(results: Mapping[str, Any], words: int) -> list[str]:
-    return [*("Method", "Metrics")[2 - words :], *results, *(["avg"] if len(results) > 1 else [])]
+def _headers(groups: Sequence[Sequence[str]], *words: str) -> list[str]:
+    return [*words, *(name for group in groups for name in [*group, *(["avg"] if len(group) > 1 else [])])]
 
 
-def _with_mean(values: Sequence[float | None], whole: bool = False) -> list[Any]:
-    """The values, and their mean where there are several; one that lacks values says of how many it is."""
-    if len(values) < 2:
-        return list(values)
-    known = [v for v in values if v is not None]
-    if not known:
-        return [*values, None]
-    mean: Any = round(float(np.mean(known))) if whole else float(np.mean(known))
-    return [*values, mean if len(known) == len(values) else f"{number(mean)} ({len(known)} of {len(values)})"]
+def _row(results: Results, groups: Sequence[Sequence[str]], figure: Callable[[Mapping[str, Any]], Any]) -> list[Any]:
+    """A figure of each sequence, and the mean of each group of several; one that lacks values says how many it has."""
+    row: list[Any] = []
+    for group in groups:
+        values = [figure(results[name]) if name in results else None for name in group]
+        row += values
+        known = [v for v in values if v is not None]
+        if len(group) < 2:
+            continue
+        if not known:
+            row.append(None)
+            continue
+        mean: Any = float(np.mean(known))
+        mean = round(mean) if all(isinstance(v, int) for v in known) else mean
+        row.append(mean if len(known) == len(values) else f"{number(mean)} ({len(known)} of {len(values)})")
+    return row
 
 
 # Files
@@ -222,7 +234,7 @@ def write_evaluations(
     folder: Path,
     withheld: Sequence[Mapping[str, Any]] = (),
     extra: Mapping[str, Any] | None = None,
-    published: Mapping[str, Mapping[str, Sequence[float | None]]] | None = None,
+    suite: Suite | None = None,
 ) -> str:
     """Everything, into the folder; the text of the tables. One sequence's figures are metrics.json itself, those of
     several are in it by name."""
@@ -233,11 +245,11 @@ def write_evaluations(
     (folder / "metrics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
     depth = {name: r for name, r in results.items() if r["kind"] == "depth"}
     posed = {name: r for name, r in results.items() if "trajectory" in r}
-    tables = [depth_table(depth)] if depth else []
+    tables = [depth_table(depth, suite)] if depth else []
     if posed:
-        tables.append(trajectory_table(posed))
+        tables.append(trajectory_table(posed, suite))
     if any(r["all"] for r in posed.values()):
-        tables += [surface_table(posed, published), completeness_table(posed)]
+        tables += [surface_table(posed, suite), completeness_table(posed, suite)]
     if withheld:
         tables.append(withheld_table(withheld))
     notes = _notes(results, record.get("gap"))

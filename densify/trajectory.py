@@ -29,13 +29,13 @@ CLIMB_POSES = 100
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One submap's poses: frame numbers (n,), ascending, and camera centres (n, 3) in map units; how many keyframes are
-    among them. `whole` is whether every localised frame is there, and not the keyframes alone."""
+    """One submap's poses: frame numbers (n,), ascending, camera centres (n, 3) in map units, and which are keyframes
+    (n,) bool. `whole` is whether every localised frame is there, and not the keyframes alone."""
 
     id: int
     numbers: np.ndarray
     centers: np.ndarray
-    keyframes: int
+    keyframe: np.ndarray
     whole: bool
 
     def __post_init__(self) -> None:
@@ -45,16 +45,23 @@ class Trajectory:
             raise InputError(f"map {self.id}: frame {self.numbers[1:][step == 0][0]} is in its trajectory twice")
 
 
-def in_order(map_id: int, numbers: Sequence[int], centers: np.ndarray, keyframes: int, whole: bool) -> Trajectory:
-    """The trajectory with its poses by frame number."""
+def in_order(
+    map_id: int,
+    numbers: Sequence[int],
+    centers: np.ndarray,
+    keyframe: Sequence[bool] | None = None,
+    whole: bool = False,
+) -> Trajectory:
+    """The trajectory with its poses by frame number; all are keyframes where nothing else is said."""
     order = np.argsort(numbers, kind="stable")
-    return Trajectory(map_id, np.asarray(numbers, int)[order], np.asarray(centers, float)[order], keyframes, whole)
+    marked = np.ones(len(order), bool) if keyframe is None else np.asarray(keyframe, bool)
+    return Trajectory(map_id, np.asarray(numbers, int)[order], np.asarray(centers, float)[order], marked[order], whole)
 
 
 def keyframe_trajectory(submap: Submap) -> Trajectory:
     """Where the keyframes of a sparse map were."""
     centers = np.stack([k.center for k in submap.keyframes])
-    return in_order(submap.id, [k.number for k in submap.keyframes], centers, len(centers), False)
+    return in_order(submap.id, [k.number for k in submap.keyframes], centers)
 
 
 def trajectory_files(path: Path) -> list[Path]:
@@ -90,16 +97,16 @@ def _read(file: Path) -> Trajectory:
         poses = read_trajectory(file)
         numbers = [frame_number(p.name) + convention.frame_offset for p in poses]
         centers = [-p.cam_from_map[:3, :3].T @ p.cam_from_map[:3, 3] for p in poses]
-        keyframes = sum(p.is_keyframe for p in poses)
-        whole = keyframes < len(poses)
+        keyframe = [p.is_keyframe for p in poses]
+        whole = not all(keyframe)
     else:
         times, map_from_cam = read_tum(file)
         numbers = [frame_number(n) + convention.frame_offset for n in frame_names(times, convention.fps, file)]
         centers = list(map_from_cam[:, :3, 3])
-        keyframes, whole = len(numbers), "keyframe" not in file.name.lower()
+        keyframe, whole = [True] * len(numbers), "keyframe" not in file.name.lower()
     if not numbers:
         raise InputError(f"{file}: no pose in it; expected at least three")
-    return in_order(map_id, numbers, np.stack(centers), keyframes, whole)
+    return in_order(map_id, numbers, np.stack(centers), keyframe, whole)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +167,7 @@ def trajectory_summary(
         "frames_localised": len(located) if whole else None,
         "localised_share": len(located) / len(numbers) if whole else None,
         "localised_of": "all frames" if whole else "not known: the trajectory holds keyframes alone",
-        "keyframes": sum(t.keyframes for t in trajectories),
+        "keyframes": len({n for t in trajectories for n in t.numbers[t.keyframe].tolist()}),
         "submaps": len(trajectories),
         "submaps_aligned": len(aligned),
         "poses": sum(len(a.numbers) for a in aligned),

@@ -205,7 +205,7 @@ def test_maps_made_with_true_depth_are_judged_as_true(run, world):
 def test_a_map_that_cannot_be_judged_says_why_and_the_others_are(run, world):
     first, second = dense_models(read_run(run))
     t = first.trajectory
-    alone = replace(first, trajectory=replace(t, numbers=t.numbers[:2], centers=t.centers[:2], keyframes=2))
+    alone = replace(first, trajectory=replace(t, numbers=t.numbers[:2], centers=t.centers[:2], keyframe=t.keyframe[:2]))
     judged = judge_maps([alone, second], world).result
     expected = {"map": 0, "keyframes": 2, "error": "2 common poses; a similarity needs at least 3"}
     assert judged["maps"][0] == expected and "dense" in judged["maps"][1]

@@ -172,7 +172,7 @@ def model(seed: int, map_from_world: Similarity, order: np.ndarray | None = None
     points = wall + 0.5 * rng.normal(size=wall.shape)
     centers = np.stack([f.true_world_from_cam[:3, 3] for f in frames]) + 0.05 * rng.normal(size=(10, 3))
     points = points if order is None else points[order]
-    trajectory = in_order(0, list(range(10)), map_from_world.apply(centers), 10, True)
+    trajectory = in_order(0, list(range(10)), map_from_world.apply(centers))
     return Model(trajectory, {"sparse": map_from_world.apply(points)})
 
 
@@ -225,7 +225,7 @@ def test_a_map_that_may_be_turned_about_its_line_of_travel_gets_no_surface_figur
     for n, center in enumerate(line + 0.2 * rng.normal(size=(10, 3))):
         straight[n][:3, 3] = center
     centers = line + 0.2 * rng.normal(size=(10, 3))
-    given = replace(model(0, IDENTITY), trajectory=in_order(0, list(range(10)), centers, 10, True))
+    given = replace(model(0, IDENTITY), trajectory=in_order(0, list(range(10)), centers))
     with pytest.raises(InputError, match="may be turned about its line of travel, and its surface cannot be compared"):
         judge_maps([given], replace(world, poses=straight))
     alone = judge_maps([replace(given, clouds={})], replace(world, poses=straight)).result

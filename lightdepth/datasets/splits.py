@@ -120,7 +120,7 @@ def folders(split: Split, root: Path, parts: Iterable[str]) -> dict[str, list[tu
     root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root}: no such folder; expected the one that holds the sequences of {split.path}")
-    found = {part: [(_located(root, c.name), c) for c in chosen] for part, chosen in split.parts.items()}
+    found = {part: [(located(root, c.name), c) for c in chosen] for part, chosen in split.parts.items()}
     asked = [part for part in parts if part in found]
     missing = [c.name for part in asked for folder, c in found[part] if folder is None]
     if missing:
@@ -253,7 +253,7 @@ def _matches(key: str, names: str | list[str]) -> bool:
     return any(fnmatchcase(key, name.lower()) for name in ([names] if isinstance(names, str) else names))
 
 
-def _located(root: Path, name: str) -> Path | None:
+def located(root: Path, name: str) -> Path | None:
     """The folder of this name, or the one below the same folder whose name means the same sequence."""
     if (root / name).is_dir():
         return root / name
