@@ -54,8 +54,6 @@ def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = Tr
     sign = np.array([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt
     scale = float((d * sign).sum() / (s**2).sum() * len(s)) if with_scale else 1.0
-    if not scale > 0:
-        raise InputError("the map's camera centres and the true ones have nothing in common: the best scale is 0")
     return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
 
@@ -248,7 +246,7 @@ class ComparedDepth:
         from lightdepth.metrics import depth_errors  # brings torchmetrics, which takes seconds to import
 
         p, q, v = (torch.from_numpy(np.ascontiguousarray(a)) for a in (self.predicted, self.truth, self.valid))
-        found = {}
+        found: dict[str, float] = {}
         for alignment in alignments:
             errors = depth_errors(p, q, v, alignment)
             assert errors is not None

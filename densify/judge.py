@@ -40,8 +40,9 @@ from densify.trajectory import (
 )
 from lightdepth.calibration import read_json
 from lightdepth.datasets import FrameSequence
+from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame, frame_number
+from lightdepth.frame import Frame
 from lightdepth.maps import read_map
 from lightdepth.prediction import read_prediction
 from lightdepth.run import git_revision, plain, versions
@@ -115,7 +116,7 @@ def judge_depth(folder: Path, truth: FrameSequence, max_depth_mm: float = 100.0,
     """
     from lightdepth.metrics import ALIGNMENTS  # brings torchmetrics, which takes seconds to import
 
-    files = {frame_number(file.name): file for file in sorted(folder.glob("*.npz"))}
+    files = numbered_files(folder, r".*?(\d+)\D*\.npz")
     numbers = shared_frames(files, truth.numbers, "predictions", truth.source, common)
     rows: dict[str, dict[str, float]] = {}
     skipped: dict[str, str] = {}

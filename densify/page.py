@@ -108,6 +108,8 @@ def _errors(page: Report, evaluation: Mapping[str, Any]) -> None:
         if "error" in entry:
             page.text(f"Map {entry['map']} could not be evaluated: {entry['error']}")
             continue
+        if "surface_error" in entry:
+            page.text(f"Map {entry['map']}: {entry['surface_error']}")
         for key, name in (
             ("sparse", "sparse map"),
             ("sparse_inliers", "sparse, inliers only"),

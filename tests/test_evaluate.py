@@ -293,6 +293,21 @@ def test_a_run_takes_the_poses_of_all_frames_where_they_are_given(run, data, tmp
         evaluate(run, data, tmp_path / "none", trajectory=tmp_path / "slam")
 
 
+def test_a_run_that_says_that_it_is_in_mm_keeps_its_scale(run, data, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    (tmp_path / "run" / "run.json").write_text(json.dumps({"unit": "mm"}))
+    evaluate(tmp_path / "run", data)
+    found = metrics(tmp_path / "run" / "evaluation")["trajectory"]
+    assert found["rms_ate_se3_mm"] > 10 * found["rms_ate_mm"]  # it is not, and that shows
+
+
+def test_two_predictions_of_a_frame_are_refused(predictions, data, tmp_path):
+    shutil.copytree(predictions, tmp_path / "p")
+    shutil.copy(tmp_path / "p" / "000001.npz", tmp_path / "p" / "1.npz")
+    with pytest.raises(InputError, match=r"000001\.npz and 1\.npz have the same number"):
+        evaluate(tmp_path / "p", data)
+
+
 def test_truth_that_does_not_fit_is_refused_and_nothing_is_written(run, predictions, tmp_path):
     write_folder(FRAMES[:7], tmp_path / "few")
     small = [
