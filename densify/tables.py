@@ -10,14 +10,16 @@ import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from densify.judge import EDGES_MM, ErrorMesh, Evaluation, with_versions
 from densify.suite import Suite, alone
-from lightdepth.figures import chart, chart_png, mesh_picture
+from lightdepth.figures import chart, chart_png, mesh_picture, png, side_by_side
 from lightdepth.report import number
 
 MODELS = {"sparse": "Sparse map", "sparse_inliers": "Sparse inliers", "dense": "Dense"}
@@ -349,10 +351,9 @@ def curve_picture(evaluation: Evaluation) -> bytes:
 
 
 def error_colors(distance: np.ndarray) -> np.ndarray:
-    """(n, 3) in [0, 1]: from blue (0) over yellow to red (5 mm and more)."""
-    from matplotlib import colormaps
-
-    return colormaps["turbo"](0.08 + 0.87 * np.clip(distance / _COLOR_MM, 0, 1))[:, :3]
+    """(n, 3) in [0, 1]: from blue (0) over green and yellow to red (5 mm and more)."""
+    level = np.rint(255 * (0.08 + 0.87 * np.clip(distance / _COLOR_MM, 0, 1))).astype(np.uint8)
+    return cv2.applyColorMap(level.reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0, ::-1] / 255
 
 
 def write_error_mesh(mesh: ErrorMesh, path: Path) -> None:
@@ -366,14 +367,16 @@ def write_error_mesh(mesh: ErrorMesh, path: Path) -> None:
 
 
 def error_picture(mesh: ErrorMesh) -> bytes:
-    """The coloured surface from outside, with its scale."""
-    from matplotlib import cm, colors
-
+    """The coloured surface from outside, and what the colours mean."""
     picture = mesh_picture(mesh.vertices, mesh.triangles, error_colors(mesh.distance))
-    figure, axes = chart((7.4, 4.8))
-    axes.imshow(picture)
-    axes.axis("off")
-    part = colors.LinearSegmentedColormap.from_list("error", error_colors(np.linspace(0, _COLOR_MM, 64)))
-    scale = cm.ScalarMappable(colors.Normalize(0, _COLOR_MM), part)
-    figure.colorbar(scale, ax=axes, shrink=0.8, label="distance to the closest true point [mm]", extend="max")
-    return chart_png(figure)
+    height, top, bottom = picture.shape[0], 70, 40
+    scale = np.full((height, 150, 3), 255, np.uint8)
+    steps = np.linspace(_COLOR_MM, 0, height - top - bottom)
+    scale[top : height - bottom, 20:44] = np.rint(255 * error_colors(steps))[:, None]
+    write = partial(cv2.putText, scale, fontFace=cv2.FONT_HERSHEY_SIMPLEX, color=(60, 60, 60), lineType=cv2.LINE_AA)
+    for line, words in enumerate(("distance to the", "closest true point")):
+        write(text=words, org=(6, 24 + 18 * line), fontScale=0.42)
+    for mm in range(int(_COLOR_MM) + 1):
+        row = round(height - bottom - mm / _COLOR_MM * (height - top - bottom))
+        write(text=f"{mm:g} mm" + " and more" * (mm == _COLOR_MM), org=(50, row + 5), fontScale=0.42)
+    return png(side_by_side([picture, scale]))

@@ -16,7 +16,7 @@ import trimesh
 from colons import colon, sequence, slam, truth
 
 from densify.cli import evaluate
-from densify.judge import dense_models, judge_depth, judge_maps, read_run, read_truth
+from densify.judge import Model, dense_models, judge_depth, judge_maps, read_run, read_truth
 from densify.pipeline import DensifyConfig, densify
 from densify.suite import alone
 from densify.tables import Table, depth_table, long_rows, surface_table, trajectory_table, write_evaluations
@@ -187,7 +187,8 @@ def test_the_order_of_the_frames_does_not_matter(run, predictions):
     assert [f.name for f in mixed] != [f.name for f in FRAMES]
     depth = [judge_depth(predictions, sequence(list(f))) for f in (FRAMES, mixed)]
     assert json.dumps(depth[0].result) == json.dumps(depth[1].result)
-    maps = [judge_maps(dense_models(read_run(run)), read_truth(sequence(list(f)))) for f in (FRAMES, mixed)]
+    models = [replace(m, clouds={"dense": m.clouds["dense"]}) for m in dense_models(read_run(run))]
+    maps = [judge_maps(models, read_truth(sequence(list(f)))) for f in (FRAMES, mixed)]
     assert json.dumps(maps[0].result) == json.dumps(maps[1].result)
     for one, other in (depth, maps):
         assert {k: v.tolist() for k, v in one.curves.items()} == {k: v.tolist() for k, v in other.curves.items()}
@@ -210,14 +211,14 @@ def test_predictions_have_nine_errors_under_four_alignments(predictions, data, t
     assert "| none (up to scale) | seq |" in text and "4 of 4 predicted frames judged (the sequence has 10)" in text
 
 
-def test_several_sequences_are_averaged_over_frames_and_over_sequences(predictions, run):
+def test_several_sequences_are_averaged_over_frames_and_over_sequences(predictions, judged):
     one = judge_depth(predictions, sequence(list(FRAMES))).result
     other = {**one, "frames_judged": 12, "mean": {k: 3 * v for k, v in one["mean"].items()}}
     rows = {tuple(r[:2]): r[2] for r in depth_table({"a": one, "b": other}).rows}
     value = one["mean"]["abs_rel_median"]
     assert rows["median", "mean over sequences"] == pytest.approx(2 * value)
     assert rows["median", "mean over frames"] == pytest.approx(value * (4 + 3 * 12) / 16)
-    found = judge_maps(dense_models(read_run(run)), read_truth(sequence(list(FRAMES)))).result
+    found = metrics(judged)
     without = {
         **found,
         "all": {},
@@ -271,7 +272,7 @@ def test_a_map_and_a_trajectory_are_judged_too(data, tmp_path):
     assert not (tmp_path / "two").exists() and not (tmp_path / "line").exists()
 
 
-def test_a_run_takes_the_poses_of_all_frames_where_they_are_given(run, data, tmp_path):
+def test_a_run_takes_the_poses_of_all_frames_and_its_unit_where_they_are_given(run, data, tmp_path):
     export = slam(FRAMES, maps=2, spurious=0.1)
     by_map = {}
     for submap in export.map.submaps:
@@ -283,22 +284,18 @@ def test_a_run_takes_the_poses_of_all_frames_where_they_are_given(run, data, tmp
             map_from_cam[:3, 3] = s * r @ f.true_world_from_cam[:3, 3] + t
             by_map[submap.id][f.name] = np.linalg.inv(map_from_cam)
     write_multimap(export.map, tmp_path / "slam", by_map)
-    evaluate(run, data, tmp_path / "e", trajectory=tmp_path / "slam")
-    found = metrics(tmp_path / "e")
+    shutil.copytree(run / "map_000", tmp_path / "run" / "map_000")
+    shutil.copytree(run / "map_001", tmp_path / "run" / "map_001")
+    (tmp_path / "run" / "run.json").write_text(json.dumps({"unit": "mm"}))
+    evaluate(tmp_path / "run", data, trajectory=tmp_path / "slam")
+    found = metrics(tmp_path / "run" / "evaluation")
+    assert found["trajectory"]["rms_ate_se3_mm"] > 10 * found["trajectory"]["rms_ate_mm"]  # not in mm, and that shows
     assert found["trajectory"]["localised_share"] == 1 and found["maps"][0]["poses"] == 10
     assert found["all"]["dense"]["points"] > 1000
     shutil.rmtree(tmp_path / "slam" / "3D_maps")
     (tmp_path / "slam" / "camera_trajectory" / "cam_traj_map_001.txt").unlink()
     with pytest.raises(InputError, match=r"map 1 has no trajectory; there are those of \[0\]"):
         evaluate(run, data, tmp_path / "none", trajectory=tmp_path / "slam")
-
-
-def test_a_run_that_says_that_it_is_in_mm_keeps_its_scale(run, data, tmp_path):
-    shutil.copytree(run, tmp_path / "run")
-    (tmp_path / "run" / "run.json").write_text(json.dumps({"unit": "mm"}))
-    evaluate(tmp_path / "run", data)
-    found = metrics(tmp_path / "run" / "evaluation")["trajectory"]
-    assert found["rms_ate_se3_mm"] > 10 * found["rms_ate_mm"]  # it is not, and that shows
 
 
 def test_two_predictions_of_a_frame_are_refused(predictions, data, tmp_path):
@@ -336,8 +333,9 @@ def test_truth_that_does_not_fit_is_refused_and_nothing_is_written(run, predicti
     for source, where, message in cases:
         with pytest.raises(InputError, match=message):
             evaluate(source, tmp_path / where, tmp_path / "out")
-    evaluate(run, tmp_path / "few", tmp_path / "common", common=True)
-    assert metrics(tmp_path / "common")["maps"][1]["poses"] == 4
+    models = [Model(m.trajectory) for m in dense_models(read_run(run))]
+    found = judge_maps(models, read_truth(sequence(list(FRAMES[:7])), with_surface=False), common=True)
+    assert [m["poses"] for m in found.result["maps"]] == [5, 4]
     assert not (tmp_path / "out").exists()
 
 
