@@ -62,13 +62,23 @@ class Sparsification:
         return self.area / random if random > 0 else 1.0
 
 
-def doubted(distance: np.ndarray, sigma: np.ndarray, true_distance: np.ndarray, valid: np.ndarray) -> Doubted | None:
-    """The valid pixels of a frame, (H, W) arrays; the scale is the median log ratio. None when there are no pixels."""
+def doubted(
+    distance: np.ndarray, sigma: np.ndarray, true_distance: np.ndarray, valid: np.ndarray, log: bool = True
+) -> Doubted | None:
+    """The valid pixels of a frame, (H, W) arrays; the scale is the median log ratio. None when there are no pixels.
+
+    Errors are those of log distance, as sigma is; or with log false of distance, in the truth's unit, where sigma is
+    that share of the distance.
+    """
     valid = valid & (true_distance > 0) & np.isfinite(true_distance) & (distance > 0) & (sigma > 0)
     if not valid.any():
         return None
-    error = np.log(distance[valid].astype(np.float64) / true_distance[valid])
-    return Doubted(error - np.median(error), sigma[valid].astype(np.float64))
+    found, true, doubt = (values[valid].astype(np.float64) for values in (distance, true_distance, sigma))
+    error = np.log(found / true)
+    scale = np.exp(-np.median(error))
+    if log:
+        return Doubted(error + np.log(scale), doubt)
+    return Doubted(scale * found - true, doubt * scale * found)
 
 
 def sparsification(frames: Iterable[Doubted], power: int = 1) -> Sparsification:

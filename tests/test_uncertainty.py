@@ -105,3 +105,11 @@ def test_the_chart_is_a_picture_and_the_summary_has_its_numbers():
     assert found["frames"] == 2 and list(found["coverage"]) == ["50%", "68%", "90%", "95%"]
     assert found["sparsification"]["mean"] == pytest.approx(sparsification(given).relative, abs=1e-3)
     assert found["sparsification"]["rms"] == pytest.approx(sparsification(given, 2).relative, abs=1e-3)
+
+
+def test_errors_of_distance_carry_the_truth_s_unit_and_sigma_s_share_of_it():
+    true = np.array([[1.0, 2.0, 4.0, 8.0, 10.0]])
+    found = 3 * true * np.array([[1.0, 1.0, 1.0, 1.25, 0.9]])  # a scale of 3, which the median takes out
+    frame = doubted(found, np.full((1, 5), 0.1), true, true > 0, log=False)
+    np.testing.assert_allclose(frame.error, [0, 0, 0, 2.0, -1.0], atol=1e-12)
+    np.testing.assert_allclose(frame.sigma, [0.1, 0.2, 0.4, 1.0, 0.9])
