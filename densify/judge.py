@@ -395,6 +395,8 @@ def judge_maps(
         "kind": "surface" if made else "trajectory",
         "unit": "mm; shares of 1",
         "alignment": "Sim(3) of each submap's trajectory to the true one (least ATE); SE(3) where the map is in mm",
+        "mask": "true points inside the frames' mask (the image without its border) and the lens's field, true depth "
+        "known (in C3VD neither 0 nor 65535); no cap; every model point counts",
         "truth": _described(truth),
         "thresholds_mm": list(thresholds_mm),
         "trajectory": {**trajectory, "ms_per_keyframe": _ms_per_keyframe(truth, trajectory["keyframes"])},

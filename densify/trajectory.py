@@ -19,7 +19,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import frame_number
 from lightdepth.maps import read_trajectory
 from lightdepth.maps.convention import EXPORTER, declared_convention, frame_names
-from lightdepth.maps.endocartoscope import TRAJECTORIES, TRAJECTORY_FILE
+from lightdepth.maps.endocartoscope import MAPS, TRAJECTORIES, TRAJECTORY_FILE
 from lightdepth.maps.tum import is_trajectory
 from lightdepth.sparse_map import Submap
 
@@ -92,7 +92,13 @@ def read_trajectories(path: Path) -> list[Trajectory]:
 def _read(file: Path) -> Trajectory:
     match = TRAJECTORY_FILE.fullmatch(file.name)
     map_id = int(match[1]) if match else 0
-    convention = declared_convention(file.parent, map_id, EXPORTER, (file.parent.parent,) if match else ())
+    tree: Path = file.parent
+    roots: tuple[Path, ...] = ()
+    if match:  # what is declared for the map holds for its trajectory
+        maps = file.parent.parent / MAPS
+        tree = next((p for p in maps.glob("*") if p.name.isdecimal() and int(p.name) == map_id), file.parent)
+        roots = (maps, maps.parent)
+    convention = declared_convention(tree, map_id, EXPORTER, roots)
     if match:
         poses = read_trajectory(file)
         numbers = [frame_number(p.name) + convention.frame_offset for p in poses]

@@ -75,7 +75,7 @@ def metrics(folder: Path) -> dict:
 
 def test_a_run_s_metrics_say_units_alignment_truth_counts_and_versions(judged):
     found = metrics(judged)
-    assert found["unit"].startswith("mm") and "Sim(3)" in found["alignment"]
+    assert found["unit"].startswith("mm") and "Sim(3)" in found["alignment"] and "no cap" in found["mask"]
     assert "every second pixel of 10 frames" in found["truth"]["cloud"] and "cube of 0.2 mm" in found["truth"]["cloud"]
     assert found["truth"]["cloud_points"] > 10_000 and found["thresholds_mm"] == [1, 2, 5]
     assert {"python", "lightdepth", "scipy"} <= set(found["versions"]) and "revision" in found

@@ -194,6 +194,8 @@ def test_a_multi_map_tree_brings_every_localised_frame(tmp_path):
     write_multimap(export.map, tmp_path, by_map)
     assert len(trajectory_files(tmp_path)) == 2
     found = read_trajectories(tmp_path)
+    (tmp_path / "3D_maps" / "1" / "densify_map.json").write_text(json.dumps({"frame_offset": -1}))
+    assert read_trajectories(tmp_path)[1].numbers.tolist() == (found[1].numbers - 1).tolist()
     # The map's own keyframes are among them, with the map's poses; frames in between have the poses given.
     assert [t.id for t in found] == [0, 1] and all(t.whole for t in found)
     assert found[0].keyframe.sum() == len(export.map.submaps[0].keyframes) < len(found[0].numbers)
