@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,10 +35,34 @@ class Surface:
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Distance (n,) along unit rays (n, 3) from origins (n, 3) or (3,) to the surface; infinite where there is
         none."""
+        return self.meet(origins, directions)[0]
+
+    def meet(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances as of `cast`, and the triangle (n,) that each ray meets, -1 where there is none."""
         if self._scene is None or not len(directions):
-            return np.full(len(directions), np.inf)
+            return np.full(len(directions), np.inf), np.full(len(directions), -1)
         rays = np.concatenate([np.broadcast_to(origins, directions.shape), directions], -1).astype(np.float32)
-        return self._scene.cast_rays(self._core.Tensor(rays))["t_hit"].numpy().astype(np.float64)
+        found = self._scene.cast_rays(self._core.Tensor(rays))
+        distance = found["t_hit"].numpy().astype(np.float64)
+        return distance, np.where(np.isfinite(distance), found["primitive_ids"].numpy().astype(int), -1)
+
+    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The points (n, 3) of the surface that are closest to points (n, 3), and their triangles (n,)."""
+        assert self._scene is not None, "a surface without triangles has no points"
+        found = self._scene.compute_closest_points(self._core.Tensor(points.astype(np.float32)))
+        return found["points"].numpy().astype(np.float64), found["primitive_ids"].numpy().astype(int)
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """What a keyframe gave to the surface: the share of its valid pixels that were fused, and their mean weight in
+    [0, 1]. And what it looks at: mean confidence and mean number of views of that part of the surface, NaN where it
+    sees none."""
+
+    fused_share: float
+    fused_weight: float
+    confidence: float = np.nan
+    views: float = np.nan
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (n,) from points (n, 3) to the closest of the surface, in single precision; infinite without any."""
@@ -50,7 +75,11 @@ class Surface:
 @dataclass(frozen=True)
 class DenseMap:
     """vertices (n, 3) and triangles (m, 3) in `unit` ("map units" or "mm"), colors (n, 3) in [0, 1]; the alignments,
-    one for each keyframe of the submap, in order. `voxel` is the size of the fusion's voxels in the same unit."""
+    one for each keyframe of the submap, in order. `voxel` is the size of the fusion's voxels in the same unit.
+
+    Where the fusion told them, weights (n,) of all views of a vertex together (1 is one view that nothing speaks
+    against), and the number of views (n,); and what each keyframe contributed, by name.
+    """
 
     submap: Submap
     vertices: np.ndarray
@@ -59,6 +88,14 @@ class DenseMap:
     alignments: tuple[Alignment, ...]
     voxel: float
     unit: str = "map units"
+    weights: np.ndarray | None = None
+    views: np.ndarray | None = None
+    contributions: Mapping[str, Contribution] = field(default_factory=dict)
+
+    @property
+    def confidence(self) -> np.ndarray | None:
+        """In [0, 1): w / (1 + w) of a vertex's weight w; one half is one view that nothing speaks against."""
+        return None if self.weights is None else self.weights / (1 + self.weights)
 
     @property
     def aligned(self) -> list[Alignment]:
@@ -87,7 +124,10 @@ class DenseMap:
         rgba = np.concatenate([np.rint(self.colors * 255), np.full((len(self.colors), 1), 255)], 1).astype(np.uint8)
         colors = rgba if len(rgba) else None  # trimesh cannot write the colours of no vertices
         mesh = trimesh.Trimesh(self.vertices * scale, self.triangles, vertex_colors=colors, process=False)
-        for suffix in formats:
+        for suffix in sorted(formats):  # ply last: glTF has no whole numbers, and would refuse `views`
+            if suffix == "ply" and self.confidence is not None and self.views is not None and len(self.vertices):
+                mesh.vertex_attributes["confidence"] = self.confidence.astype(np.float32)
+                mesh.vertex_attributes["views"] = self.views.astype(np.int32)
             mesh.export(folder / f"mesh.{suffix}")
         normals = mesh.vertex_normals if len(self.vertices) else np.zeros((0, 3))
         write_cloud(folder / "cloud.ply", self.vertices * scale, rgba[:, :3], normals)
@@ -106,10 +146,14 @@ class DenseMap:
     def _write_keyframes(self, path: Path, scale: float) -> None:
         with path.open("w", newline="") as file:
             table = csv.writer(file)
-            table.writerow(["keyframe", "frame", "ok", "scale", "sigma", "points", "inliers", "inlier_share", "reason"])
+            columns = ["keyframe", "frame", "ok", "scale", "sigma", "points", "inliers", "inlier_share"]
+            table.writerow([*columns, *Contribution.__dataclass_fields__, "reason"])
             for keyframe, a in zip(self.submap.keyframes, self.alignments, strict=True):
                 row = [a.keyframe, keyframe.number, int(a.ok), f"{a.scale * scale:.9g}", f"{a.sigma * scale:.6g}"]
-                table.writerow([*row, a.points, len(a.inlier_ids), f"{a.inlier_share:.4f}", a.reason])
+                row += [a.points, len(a.inlier_ids), f"{a.inlier_share:.4f}"]
+                found = self.contributions.get(a.keyframe)
+                row += [f"{value:.4f}" for value in astuple(found)] if found else [""] * len(fields(Contribution))
+                table.writerow([*row, a.reason])
 
 
 def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.ndarray | None = None) -> None:
@@ -134,7 +178,8 @@ def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.
 @dataclass(frozen=True)
 class DenseMapFiles:
     """A dense map read back from its folder: the surface, the sparse points with their colours, the keyframes' frame
-    numbers and poses map_from_cam (n, 4, 4), and the map's camera."""
+    numbers and poses map_from_cam (n, 4, 4), and the map's camera; confidence and views of each vertex, where the file
+    has them."""
 
     id: int
     vertices: np.ndarray
@@ -144,6 +189,8 @@ class DenseMapFiles:
     numbers: np.ndarray
     map_from_cam: np.ndarray
     camera: CameraModel
+    confidence: np.ndarray | None = None
+    views: np.ndarray | None = None
 
 
 def read_dense_map(folder: Path) -> DenseMapFiles:
@@ -157,6 +204,10 @@ def read_dense_map(folder: Path) -> DenseMapFiles:
     mesh, cloud = _read_ply(folder / "mesh.ply"), _read_ply(folder / "sparse.ply")
     triangles = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), int)
     numbers, poses = read_tum(folder / "trajectory.tum")
+    # trimesh keeps what it has no name for in the raw file: a structured array, or a dict of columns
+    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data") if len(triangles) else None
+    names = () if raw is None else getattr(getattr(raw, "dtype", None), "names", None) or tuple(raw)
+    own = {name: np.asarray(raw[name]).ravel() if name in names else None for name in ("confidence", "views")}
     return DenseMapFiles(
         id=int(map_id),
         vertices=np.asarray(getattr(mesh, "vertices", np.zeros((0, 3))), float),  # an empty mesh is read as a scene
@@ -166,6 +217,7 @@ def read_dense_map(folder: Path) -> DenseMapFiles:
         numbers=numbers.round().astype(int),
         map_from_cam=poses,
         camera=read_camera(folder / "camera.json"),
+        **own,
     )
 
 

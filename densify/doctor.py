@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from densify.fusion import FusionConfig, TsdfVolume
-from densify.rectify import PinholeView
+from densify.rectify import RectifyConfig, surface_view
 from lightdepth import native
+from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
+from lightdepth.prediction import DepthPrediction
 from lightdepth.run import versions
 
 
@@ -77,13 +79,12 @@ def _torchvision() -> Finding:
 
 def fused_plane_error(voxel: float = 0.5, distance: float = 30.0) -> tuple[int, float]:
     """Vertices of a fused plane at `distance`, and their largest error along the axis, in voxels."""
-    width, height, focal = 160, 120, 120.0
-    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    depth = np.full((height, width), distance, np.float32)
-    view = PinholeView(depth, np.full((height, width, 3), 0.5, np.float32), matrix, np.eye(4))
+    camera = Pinhole(160, 120, 120.0, 120.0, 80.0, 60.0)
+    rays, valid = camera.rays()
+    prediction = DepthPrediction("plane", (distance / rays[..., 2]).astype(np.float32), valid, camera, "doctor")
     volume = TsdfVolume(voxel, FusionConfig())
-    volume.integrate(view, np.eye(4))
-    vertices, _, _ = volume.extract_mesh()
+    volume.integrate(surface_view(prediction, np.full((120, 160, 3), 0.5, np.float32), RectifyConfig()), np.eye(4))
+    vertices = volume.extract_mesh().vertices
     error = float(np.abs(vertices[:, 2] - distance).max() / voxel) if len(vertices) else np.inf
     return len(vertices), error
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from densify.alignment import Alignment, AlignmentConfig, align
-from densify.dense_map import DenseMap
+from densify.coverage import Coverage, CoverageConfig, contribution, coverage, looked_at
+from densify.dense_map import Contribution, DenseMap
 from densify.fusion import FusionConfig, TsdfVolume
-from densify.rectify import RectifyConfig, pinhole_views
+from densify.rectify import RectifyConfig, surface_view
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
@@ -34,6 +35,7 @@ class DensifyConfig:
     fusion: FusionConfig = field(default_factory=FusionConfig)
     withhold: float = 0.2
     seed: int = 0
+    coverage: CoverageConfig = field(default_factory=CoverageConfig)
 
     def __post_init__(self) -> None:
         if not 0 <= self.withhold < 1:
@@ -59,14 +61,15 @@ class Withheld:
 @dataclass(frozen=True)
 class SubmapResult:
     """A surface, what withheld points say about it, the share of masked pixels of the aligned keyframes that look at
-    it, seconds per step, summed over the keyframes, and keyframes whose image is missing or unreadable, with the
-    reason."""
+    it, seconds per step, summed over the keyframes, keyframes whose image is missing or unreadable, with the
+    reason, and what of the wall was seen."""
 
     dense: DenseMap
     withheld: Withheld | None
     seen_share: float
     seconds: dict[str, float]
     unread: dict[str, str] = field(default_factory=dict)
+    coverage: Coverage | None = None
 
 
 class _Clock(dict[str, float]):
@@ -117,6 +120,7 @@ def densify_submap(
     aligned: list[Keyframe] = []
     unread: dict[str, str] = {}
     withheld: list[tuple[Keyframe, ObservedDistances]] = []
+    contributions: dict[str, Contribution] = {}
     for keyframe in submap.keyframes:
         with clock("read"):
             frame, reason = _frame_of(keyframe, frames)
@@ -136,18 +140,33 @@ def densify_submap(
         if alignment.ok:
             with clock("integrate"):
                 reach = config.fusion.far * alignment.range_90
-                for view in pinhole_views(prediction.scaled(alignment.scale), frame.image, config.rectify, reach):
-                    volume.integrate(view, keyframe.cam_from_map)
+                view = surface_view(prediction.scaled(alignment.scale), frame.image, config.rectify, reach)
+                volume.integrate(view, keyframe.cam_from_map)
+                contributions[keyframe.name] = contribution(view, prediction)
             aligned.append(keyframe)
         withheld.append((keyframe, kept_back))
         if on_keyframe is not None:
             on_keyframe(KeyframeView(submap, keyframe, alignment, frame, prediction, observed))
     with clock("extract"):
-        dense = DenseMap(submap, *volume.extract_mesh(), tuple(alignments), voxel)
+        mesh = volume.extract_mesh()
+    dense = DenseMap(
+        submap,
+        mesh.vertices,
+        mesh.triangles,
+        mesh.colors,
+        tuple(alignments),
+        voxel,
+        "map units",
+        mesh.weights,
+        mesh.views,
+    )
+    with clock("cover"):
+        dense = replace(dense, contributions={k.name: looked_at(dense, k, contributions[k.name]) for k in aligned})
+        covered = coverage(dense, config.coverage)
     with clock("judge"):
         judged = withheld_error(dense, withheld) if config.withhold else None
         seen = seen_share(dense, aligned, frames)
-    return SubmapResult(dense, judged, seen, dict(clock), unread)
+    return SubmapResult(dense, judged, seen, dict(clock), unread, covered)
 
 
 def _frame_of(keyframe: Keyframe, frames: FrameSequence) -> tuple[Frame | None, str]:

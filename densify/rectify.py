@@ -1,12 +1,15 @@
-"""Distance on any lens -> depth of pinhole views, which TSDF fusion needs.
+"""Distance on any lens -> what fusion takes: a small plane in every pixel, its weight, and where each direction looks.
 
-A pinhole camera is one view. Any other lens becomes faces of a cube around the camera centre, each 90 degrees wide,
-only those that its field touches: together they hold every direction in front exactly once.
+Notation: d distance along the unit ray r through a pixel, P = d r, m the unit normal of the surface there, turned away
+from the camera. All in camera axes. The plane of a pixel is m · X = m · P.
+
+No image is resampled and no cube has seams: one table over directions (stereographic, so that it holds more than a
+half space) says which pixel each direction falls into, half-pixel rim included. So every valid pixel enters the fusion
+and none enters twice, whatever the lens. Between pixel centres the plane says where the surface is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,119 +17,237 @@ import cv2
 import numpy as np
 
 from lightdepth.camera import CameraModel, Pinhole
+from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
+
+FULL = 255
+"""The weight of a pixel that nothing speaks against. Weights are whole numbers, so that sums of them are exact."""
 
 
 @dataclass(frozen=True)
 class RectifyConfig:
-    """Which predicted pixels are handed to the fusion, and how finely."""
+    """Which predicted pixels are handed to the fusion, how finely, and with what weight."""
 
-    focal_px: float = 256.0  # resolution of the views, pixels per radian at most
-    max_jump: float = 0.15  # a step in log distance between neighbouring view pixels above this is an edge: left out
-    min_cosine: float = 0.05  # cosine between ray and normal below this is grazing: left out
+    focal_px: float = 256.0  # pixels per radian at most; finer images are merged, block by block
+    field: str = "whole"  # or pinhole: only what an undistorted pinhole image of the same size would hold
+    # Log distance per radian above which the surface is lost from sight, an edge or nearly along the ray (2.9 degrees
+    # at 20): left out, on both sides, because what lies between is a mixture that would become a curtain.
+    max_slope: float = 20.0
+    dark: float = 0.02  # brightest channel below this: too dark to tell; the weight falls to `unlit`
+    bright: float = 0.98  # brightest channel above this: clipped; the weight falls to `unlit`
+    unlit: float = 0.5  # weight of a pixel in the dark or clipped; less was tried and made surfaces a little worse
+    sigma: float = 0.15  # uncertainty of log distance at which the weight has halved
+
+    def __post_init__(self) -> None:
+        if self.field not in ("whole", "pinhole"):
+            raise InputError(f"field {self.field!r}; expected whole or pinhole")
 
 
 @dataclass(frozen=True)
-class PinholeView:
-    """depth (H, W) float32 along the view's axis, 0 where nothing is known; color (H, W, 3) float32;
-    matrix K (3, 3), first pixel's centre at (0.5, 0.5); view_from_cam (4, 4)."""
+class DirectionTable:
+    """The pixel of every direction: cells (n, n) int32, the index of the pixel, or `outside`.
 
-    depth: np.ndarray
-    color: np.ndarray
-    matrix: np.ndarray
-    view_from_cam: np.ndarray
+    A direction (x, y, z) of length l falls into the cell at column x s + n / 2, row y s + n / 2, s = scale / (l + z).
+    """
+
+    cells: np.ndarray
+    scale: float
+    outside: int
+
+    def look_up(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Pixels of directions, all of one shape."""
+        size, length = np.float32(len(self.cells)), np.sqrt(x * x + y * y + z * z)
+        # A little aside, so that straight behind is far out instead of in the middle.
+        aside = length * np.float32(1e-5)
+        scale = np.float32(self.scale) / np.maximum(length + z, np.maximum(np.float32(0.1) * aside, np.float32(1e-30)))
+        column, row = (((side + aside) * scale + size / 2).clip(0, size - 1).astype(np.int32) for side in (x, y))
+        return self.cells.take(row * np.int32(size) + column)
 
 
 @dataclass(frozen=True)
-class _Grid:
-    """Where each pixel of a view looks: source pixels (H, W, 2), their validity, unit rays (H, W, 3) in view axes."""
+class SurfaceView:
+    """What one image says of the surface: for each of n pixels a point (3, n), the plane m · X = b through it as
+    (m, b) (n, 4), both float32, a weight (n,) and a colour (n, 3), both uint8; weight 0 where nothing is known.
 
-    pixels: np.ndarray
-    valid: np.ndarray
+    One more row at the end stands for all directions outside the image. The table tells the pixel of a direction.
+    """
+
+    points: np.ndarray
+    planes: np.ndarray
+    weights: np.ndarray
+    colors: np.ndarray
+    table: DirectionTable
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A camera on the grid of merged pixels: unit rays (3, h, w); the angles to the next pixel along u (h, w - 1) and v
+    (h - 1, w); the pixels (H, W) of the whole image that a pinhole would hold."""
+
     rays: np.ndarray
-    matrix: np.ndarray
-    view_from_cam: np.ndarray
+    gaps: tuple[np.ndarray, np.ndarray]
+    in_pinhole: np.ndarray
+    table: DirectionTable
 
 
-_FACES = {  # rows: the view's x, y, z axes in camera axes
-    "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    "right": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
-    "left": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
-    "down": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
-    "up": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
-}
+def surface_view(
+    prediction: DepthPrediction, image: np.ndarray, config: RectifyConfig, max_distance: float = np.inf
+) -> SurfaceView:
+    """What a (scaled) prediction and its image (H, W, 3) say of the surface; beyond max_distance nothing is known."""
+    camera = prediction.camera
+    merged = max(1, int(np.ceil(camera.focal_length / config.focal_px - 0.01)))
+    lens = _lens(camera, merged)
+    valid = prediction.valid & camera.rays()[1] & (prediction.distance > 0) & np.isfinite(prediction.distance)
+    if config.field == "pinhole":
+        valid &= lens.in_pinhole
+    distance = np.where(valid, prediction.distance, 1).astype(np.float32, copy=False)
+    light = image.max(-1).astype(np.float32)
+    color, sigma = image, prediction.uncertainty
+    points = distance * lens.rays if merged == 1 else None
+    edge: np.ndarray | bool = False
+    if merged > 1:
+        points = np.stack([_merge(distance * axis, valid, merged) for axis in np.moveaxis(camera.rays()[0], -1, 0)])
+        log = np.log(distance)
+        edge = (
+            _merge(log**2, valid, merged) - _merge(log, valid, merged) ** 2
+            > (config.max_slope * merged / camera.focal_length / 2) ** 2
+        )
+        light, sigma = _merge(light, valid, merged), None if sigma is None else _merge(sigma, valid, merged)
+        color = np.stack([_merge(image[..., c], valid, merged) for c in range(3)], -1)
+        valid = _merge(valid, np.ones_like(valid), merged) > 0
+        distance = np.where(valid, np.sqrt((points**2).sum(0)), 1)
+    assert points is not None
+    normals, edges = _normals(points, distance, valid, lens, config.max_slope)
+    cosine = (normals * lens.rays).sum(0)
+    weight = FULL * cosine * light_weight(light, config)
+    if sigma is not None:
+        weight /= 1 + (sigma / config.sigma) ** 2
+    known = valid & ~(edges | edge) & (distance <= max_distance)
+    weight = np.where(known, np.rint(np.clip(weight, 1, FULL)), 0)
+    count = valid.size
+    planes = np.empty((count + 1, 4), np.float32)
+    planes[:count, :3] = normals.reshape(3, count).T
+    planes[:count, 3] = (normals * points).sum(0).ravel()
+    weights, colors = np.zeros(count + 1, np.uint8), np.zeros((count + 1, 4), np.uint8)
+    weights[:count] = weight.ravel()
+    colors[:count, :3], colors[:, 3] = (np.clip(color, 0, 1) * 255 + 0.5).reshape(-1, 3), 1
+    planes[weights == 0] = 0
+    points = np.concatenate([points.reshape(3, count), np.zeros((3, 1), np.float32)], 1)
+    return SurfaceView(points, planes, weights, colors, lens.table)
+
+
+def light_weight(value: np.ndarray, config: RectifyConfig) -> np.ndarray:
+    """1 where the brightest channel (H, W) is well lit, falling to `unlit` towards black and towards saturation."""
+    lit = np.clip(np.minimum(value / config.dark, (1 - value) / (1 - config.bright)), 0, 1)
+    return config.unlit + (1 - config.unlit) * lit
+
+
+def _normals(
+    points: np.ndarray, distance: np.ndarray, valid: np.ndarray, lens: _Lens, max_slope: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals away from the camera (3, h, w), and the pixels beside an edge (h, w).
+
+    P_u x P_v, with differences of P to both sides, or to one where the other is across an edge or unknown: exact on a
+    plane. A pixel with no neighbour along an axis faces the camera.
+    """
+    edges, sums = np.zeros(valid.shape, bool), []
+    for axis, gap in zip((1, 0), lens.gaps, strict=True):
+        (one, two), (here, there) = _halves(distance, axis), _halves(valid, axis)
+        both = here & there
+        across = both & (np.abs(two - one) > max_slope * gap * np.minimum(one, two))
+        for side in _halves(edges, axis):
+            side |= across
+        one, two = _halves(points, axis)
+        steps = (two - one) * (both & ~across)
+        total = np.zeros_like(points)
+        for side in _halves(total, axis):
+            side += steps
+        sums.append(total)
+    (a, b, c), (d, e, f) = sums
+    normals = np.stack([b * f - c * e, c * d - a * f, a * e - b * d])
+    length = np.sqrt((normals**2).sum(0))
+    normals = np.where(length > 0, normals / np.maximum(length, 1e-30), lens.rays)
+    return normals, edges
+
+
+def _halves(array: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """All but the last, and all but the first, of (..., h, w) along v (0) or u (1): views."""
+    return (array[..., :-1, :], array[..., 1:, :]) if axis == 0 else (array[..., :-1], array[..., 1:])
+
+
+def _merge(values: np.ndarray, valid: np.ndarray, size: int) -> np.ndarray:
+    """Means (h, w) over the valid pixels of blocks of size x size, 0 where there are none; the last may be smaller."""
+    total, count = np.where(valid, values, 0).astype(np.float32), valid.astype(np.float32)
+    for axis in (0, 1):
+        starts = np.arange(0, valid.shape[axis], size)
+        total, count = (np.add.reduceat(a, starts, axis) for a in (total, count))
+    return total / np.maximum(count, 1)
 
 
 @lru_cache(maxsize=8)
-def _grids(camera: CameraModel, focal_px: float) -> tuple[_Grid, ...]:
+def _lens(camera: CameraModel, merged: int) -> _Lens:
+    height, width = -(-camera.height // merged), -(-camera.width // merged)
+    u, v = np.meshgrid((np.arange(width) + 0.5) * merged, (np.arange(height) + 0.5) * merged)
+    rays = np.moveaxis(camera.unproject(np.stack([u, v], -1))[0], -1, 0)
+    gaps = [np.linalg.norm(two - one, axis=0).astype(np.float32) for one, two in (_halves(rays, a) for a in (1, 0))]
+    rays = np.ascontiguousarray(rays, np.float32)
+    return _Lens(rays, (gaps[0], gaps[1]), _in_pinhole(camera), _table(camera, merged))
+
+
+def _in_pinhole(camera: CameraModel) -> np.ndarray:
+    """Pixels (H, W) that an undistorted image of the same size, focal length and principal point would hold."""
+    rays, valid = camera.rays()
     if isinstance(camera, Pinhole):
-        shrink = min(1.0, focal_px / camera.focal_length)
-        small = camera.resized(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
-        rays, _ = small.rays()
-        return (_grid(camera, rays, small.matrix, np.eye(3)),)
-    half = round(min(focal_px, camera.focal_length))
-    matrix = np.array([[half, 0, half], [0, half, half], [0, 0, 1.0]])
-    rays, _ = Pinhole(2 * half, 2 * half, half, half, half, half).rays()
-    grids = (_grid(camera, rays, matrix, np.array(axes, float)) for axes in _FACES.values())
-    return tuple(_cropped(grid) for grid in grids if grid.valid.any())
+        return valid
+    center = camera.project(np.array([0.0, 0.0, 1.0]))[0]
+    front = valid & (rays[..., 2] > 1e-6)
+    place = camera.focal_length * rays[..., :2] / np.where(front, rays[..., 2], 1)[..., None] + center
+    return front & (place >= 0).all(-1) & (place[..., 0] <= camera.width) & (place[..., 1] <= camera.height)
 
 
-def _grid(camera: CameraModel, rays: np.ndarray, matrix: np.ndarray, view_from_cam: np.ndarray) -> _Grid:
-    pixels, valid = camera.project(rays @ view_from_cam)
-    pose = np.eye(4)
-    pose[:3, :3] = view_from_cam
-    return _Grid(pixels.astype(np.float32), valid, rays, matrix, pose)
+def _table(camera: CameraModel, merged: int, largest: int = 2500) -> DirectionTable:
+    """Cells of 0.6 of the least distance between neighbouring pixels, so that every pixel has one."""
+    rays, valid = camera.rays()
+    plane = np.moveaxis(rays[..., :2] / (1 + rays[..., 2:]), -1, 0)
+    gaps = [
+        np.linalg.norm(two - one, axis=0)[np.logical_and(*_halves(valid, a))]
+        for a in (0, 1)
+        for one, two in [_halves(plane, a)]
+    ]
+    gap = np.concatenate([*gaps, [1.0]])
+    reach = float(np.abs(plane[:, valid]).max(initial=0) + np.sort(gap)[-2:].min())
+    size = 4 * int(np.clip(2 * reach / (0.6 * merged * gap.min()), 16, largest) / 4 + 1)
+    scale = size / (2 * reach)
+    pixels, seen = _projected_cells(camera, size, scale)
+    width, height = -(-camera.width // merged), -(-camera.height // merged)
+    column, row = np.minimum(pixels[seen] // merged, (width - 1, height - 1)).astype(np.int32).T
+    cells = np.full((size, size), height * width, np.int32)
+    cells[seen] = row * width + column
+    return DirectionTable(cells, scale, height * width)
 
 
-def _cropped(grid: _Grid) -> _Grid:
-    """The part of a face that the field touches."""
-    rows, columns = np.flatnonzero(grid.valid.any(1)), np.flatnonzero(grid.valid.any(0))
-    r, c = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    matrix = grid.matrix.copy()
-    matrix[:2, 2] -= (c.start, r.start)
-    return _Grid(grid.pixels[r, c], grid.valid[r, c], grid.rays[r, c], matrix, grid.view_from_cam)
+def _projected_cells(camera: CameraModel, size: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (size, size, 2) of the middles of all cells, and whether the image holds them.
 
-
-def pinhole_views(
-    prediction: DepthPrediction, image: np.ndarray, config: RectifyConfig, max_distance: float = np.inf
-) -> Iterator[PinholeView]:
-    """Views of a (scaled) prediction with the image (H, W, 3) as colour; beyond max_distance nothing is known.
-
-    A view pixel is known only where the source pixels around it are all valid.
+    Every fourth corner of a cell is projected, what lies between is interpolated (to far less than a pixel: lenses are
+    smooth), and the neighbourhood of the rim is projected cell by cell.
     """
-    distance = np.where(prediction.valid, prediction.distance, 0).astype(np.float32)
-    known = prediction.valid.astype(np.float32)
-    for grid in _grids(prediction.camera, config.focal_px):
-        x, y = grid.pixels[..., 0] - 0.5, grid.pixels[..., 1] - 0.5  # cv2 puts the first pixel's centre at (0, 0)
-        sampled = cv2.remap(distance, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        share = cv2.remap(known, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        color = cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        use = grid.valid & (share > 0.999) & (sampled > 0) & (sampled <= max_distance)
-        use &= ~_edges(sampled, use, config.max_jump) & ~_grazing(sampled, grid.rays, config.min_cosine)
-        depth = np.where(use, sampled * grid.rays[..., 2], 0).astype(np.float32)
-        if use.any():
-            yield PinholeView(depth, np.ascontiguousarray(color), grid.matrix, grid.view_from_cam)
 
+    def projected(column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        p, q = (column - size / 2) / scale, (row - size / 2) / scale
+        return camera.project(np.stack([p, q, (1 - p * p - q * q) / 2], -1))
 
-def _edges(distance: np.ndarray, known: np.ndarray, max_jump: float) -> np.ndarray:
-    """Pixels on either side of a jump of log distance: their depth is a mixture, and fusing it makes curtains."""
-    log = np.log(np.where(known, distance, 1.0))
-    edge = np.zeros(distance.shape, bool)
-    for axis in (0, 1):
-        jump = np.abs(np.diff(log, axis=axis)) > max_jump
-        both = known.take(range(1, known.shape[axis]), axis) & known.take(range(known.shape[axis] - 1), axis)
-        jump &= both
-        padding = [(0, 0), (0, 0)]
-        padding[axis] = (0, 1)
-        edge |= np.pad(jump, padding)
-        padding[axis] = (1, 0)
-        edge |= np.pad(jump, padding)
-    return edge
-
-
-def _grazing(distance: np.ndarray, rays: np.ndarray, min_cosine: float) -> np.ndarray:
-    points = distance[..., None] * rays
-    normals = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
-    length = np.linalg.norm(normals, axis=-1)
-    cosine = np.abs((normals * rays).sum(-1)) / np.where(length > 0, length, 1)
-    return cosine < min_cosine
+    corners, known = projected(*np.meshgrid(np.arange(0, size + 1, 4.0), np.arange(0, size + 1, 4.0)))
+    pixels = np.empty((size, size, 2), np.float32)
+    for i, j in np.ndindex(4, 4):
+        low, left = (i + 0.5) / 4, (j + 0.5) / 4
+        upper = (1 - left) * corners[:-1, :-1] + left * corners[:-1, 1:]
+        lower = (1 - left) * corners[1:, :-1] + left * corners[1:, 1:]
+        pixels[i::4, j::4] = (1 - low) * upper + low * lower
+    inner, outer = (
+        cv2.erode(a.astype(np.uint8), np.ones((4, 4)), anchor=(1, 1))[:-1, :-1] > 0 for a in (known, ~known)
+    )
+    seen, rim = (np.kron(a, np.ones((4, 4), bool)) for a in (inner, ~inner & ~outer))
+    row, column = np.nonzero(rim)
+    pixels[rim], seen[rim] = projected(column + 0.5, row + 0.5)
+    return pixels, seen

@@ -14,6 +14,7 @@ from colons import colon, sequence, slam, truth
 from densify.alignment import Alignment
 from densify.dense_map import GREEN, GREY, RED, DenseMap, Surface, read_dense_map, write_cloud
 from densify.pipeline import DensifyConfig, densify
+from lightdepth import native
 from lightdepth.calibration import read_camera
 from lightdepth.datasets.folder import read_tum
 from lightdepth.errors import InputError
@@ -93,7 +94,8 @@ def test_wrong_points_are_red(dense, folder):
 def test_every_keyframe_has_a_row_with_its_scale_or_its_reason(dense, tmp_path):
     failed = Alignment("000002.png", points=3, reason="3 observed points, with a comma; at least 8")
     alignments = (*dense.alignments[:2], failed, dense.alignments[3])
-    replace(dense, alignments=alignments).write(tmp_path / "map_000")
+    given = {name: c for name, c in dense.contributions.items() if name != failed.keyframe}
+    replace(dense, alignments=alignments, contributions=given).write(tmp_path / "map_000")
     with (tmp_path / "map_000" / "keyframes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [r["keyframe"] for r in rows] == [f"{i:06d}.png" for i in range(4)]
@@ -101,6 +103,7 @@ def test_every_keyframe_has_a_row_with_its_scale_or_its_reason(dense, tmp_path):
     assert float(rows[0]["scale"]) == pytest.approx(dense.alignments[0].scale, rel=1e-8)
     assert int(rows[0]["inliers"]) == len(dense.alignments[0].inlier_ids)
     assert rows[2]["reason"] == "3 observed points, with a comma; at least 8" and rows[0]["reason"] == ""
+    assert rows[2]["fused_share"] == rows[2]["views"] == ""
 
 
 def test_the_trajectory_has_frame_numbers_for_times_and_the_camera_is_the_map_s(dense, folder):
@@ -126,6 +129,34 @@ def test_lengths_are_in_millimetres_where_their_unit_is_known(dense, tmp_path):
     assert float(row["sigma"]) == pytest.approx(5 * dense.alignments[0].sigma, rel=1e-4)
 
 
+def test_confidence_and_views_of_every_vertex_are_in_the_ply_for_us_and_for_others(dense, folder):
+    read = read_dense_map(folder)
+    np.testing.assert_allclose(read.confidence, dense.confidence, atol=1e-6)
+    np.testing.assert_array_equal(read.views, dense.views)
+    assert read.views.min() >= 1 and read.views.max() == 4 and 0 < read.confidence.min() < read.confidence.max() < 1
+    header = (folder / "mesh.ply").read_bytes().split(b"end_header")[0]
+    assert b"property float confidence\n" in header and b"property int views\n" in header
+    mesh = native.open3d().t.io.read_triangle_mesh(str(folder / "mesh.ply"))
+    np.testing.assert_allclose(mesh.vertex.positions.numpy(), dense.vertices, rtol=1e-5, atol=1e-6)
+    assert len(mesh.triangle.indices) == len(dense.triangles)
+
+
+def test_a_surface_of_an_older_run_has_no_confidence(dense, tmp_path):
+    replace(dense, weights=None, views=None).write(tmp_path / "map_000")
+    read = read_dense_map(tmp_path / "map_000")
+    assert read.confidence is None and read.views is None and len(read.vertices) == len(dense.vertices)
+
+
+def test_the_table_says_what_each_keyframe_gave_and_what_it_looks_at(dense, folder):
+    with (folder / "keyframes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row, keyframe in zip(rows, dense.submap.keyframes, strict=True):
+        expected = dense.contributions[keyframe.name]
+        for name in ("fused_share", "fused_weight", "confidence", "views"):
+            assert float(row[name]) == pytest.approx(getattr(expected, name), abs=1e-4)
+        assert 0.8 < expected.fused_share <= 1 and 0.3 < expected.fused_weight < 1 and 1 <= expected.views <= 4
+
+
 def test_what_was_written_is_read(dense, folder):
     read = read_dense_map(folder)
     assert read.id == 0 and read.numbers.tolist() == [0, 1, 2, 3]
@@ -136,7 +167,9 @@ def test_what_was_written_is_read(dense, folder):
 
 def test_an_empty_surface_is_written_and_read(dense, tmp_path):
     empty = np.zeros((0, 3))
-    nothing = replace(dense, vertices=empty, triangles=empty.astype(int), colors=empty)
+    nothing = replace(
+        dense, vertices=empty, triangles=empty.astype(int), colors=empty, weights=empty[:, 0], views=empty[:, 0]
+    )
     nothing.write(tmp_path / "map_003")
     read = read_dense_map(tmp_path / "map_003")
     assert read.id == 3 and read.vertices.shape == (0, 3) and read.triangles.shape == (0, 3) and len(read.sparse)

@@ -215,7 +215,7 @@ def test_every_submap_has_its_own_scale_and_every_keyframe_is_shown_once():
     for result in results:
         scale = found.map_from_world[result.dense.submap.id][0]
         assert np.median([a.scale for a in result.dense.aligned]) == pytest.approx(scale, rel=0.03)
-        assert {"read", "predict", "align", "integrate", "extract", "judge"} == set(result.seconds)
+        assert {"read", "predict", "align", "integrate", "extract", "cover", "judge"} == set(result.seconds)
     assert [(v.submap.id, v.keyframe.number) for v in shown] == [
         (s.id, k.number) for s in found.map.submaps for k in s.keyframes
     ]

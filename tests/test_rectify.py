@@ -1,123 +1,177 @@
-"""Distance on any lens as depth of pinhole views."""
+"""Distance on any lens as what fusion takes: planes with weights, each direction in one pixel."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
-import cv2
 import numpy as np
 import pytest
-from scenes import cylinder, slanted_plane, sphere
+from scenes import Scene, cylinder, slanted_plane, sphere
 
-from densify.fusion import FusionConfig, TsdfVolume
-from densify.rectify import PinholeView, RectifyConfig, pinhole_views
+from densify.rectify import FULL, RectifyConfig, SurfaceView, light_weight, surface_view
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.prediction import DepthPrediction
 from lightdepth.tube import lens
 
 PINHOLE = Pinhole(120, 90, 70.0, 72.0, 58.0, 46.0)
-FISHEYE = lens("fisheye", 240, 192)
-C3VD = lens("c3vd", 200, 160)
-KEEP_ALL = RectifyConfig(max_jump=np.inf, min_cosine=-1.0)
+FISHEYE = lens("fisheye", 120, 96)
+C3VD = lens("c3vd", 100, 80)
+LENSES = pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, C3VD], ids=["pinhole", "fisheye", "c3vd"])
 
 
-def grey(camera: CameraModel) -> np.ndarray:
-    return np.full((camera.height, camera.width, 3), 0.5, np.float32)
+def view_of(prediction: DepthPrediction, config: RectifyConfig = RectifyConfig(), **given) -> SurfaceView:
+    camera = prediction.camera
+    return surface_view(prediction, np.full((camera.height, camera.width, 3), 0.5, np.float32), config, **given)
 
 
-def views(prediction: DepthPrediction, config: RectifyConfig = RectifyConfig(), **given) -> list[PinholeView]:
-    return list(pinhole_views(prediction, grey(prediction.camera), config, **given))
+def weights(view: SurfaceView, camera: CameraModel) -> np.ndarray:
+    return view.weights[:-1].reshape(camera.height, camera.width)
 
 
-def looked_up(view: PinholeView, rays: np.ndarray) -> np.ndarray:
-    """Depth (n,) of the view's pixel that each ray (n, 3) in camera axes falls on, 0 where it falls on none."""
-    in_view = rays @ view.view_from_cam[:3, :3].T
-    height, width = view.depth.shape
-    pixels = in_view @ view.matrix.T
-    front = pixels[:, 2] > 1e-9
-    column, row = np.floor(pixels[:, :2] / np.where(front, pixels[:, 2], 1)[:, None]).astype(int).T
-    inside = front & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return np.where(inside, view.depth[row.clip(0, height - 1), column.clip(0, width - 1)], 0)
+@cache
+def directions(camera: CameraModel, count: int = 100_000) -> np.ndarray:
+    """Unit rays through places drawn anywhere in the image, (n, 3), with the pixel of each (n,)."""
+    places = np.random.default_rng(0).random((count, 2)) * (camera.width, camera.height)
+    rays, valid = camera.unproject(places)
+    column, row = places[valid].astype(int).T
+    return rays[valid], row * camera.width + column
 
 
-def test_a_pinhole_image_passes_exactly():
-    scene = slanted_plane(PINHOLE)
-    (view,) = views(scene.prediction())
-    distance, rays = scene.distance[0, 0].numpy(), scene.rays[0].permute(1, 2, 0).numpy()
-    np.testing.assert_array_equal(view.matrix, PINHOLE.matrix)
-    np.testing.assert_array_equal(view.view_from_cam, np.eye(4))
-    valid = cv2.erode(scene.valid[0, 0].numpy().astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    assert (view.depth[valid] > 0).mean() > 0.99
-    known = view.depth > 0
-    np.testing.assert_allclose(view.depth[known], (distance * rays[..., 2])[known], rtol=1e-5)
+@LENSES
+def test_every_valid_pixel_of_any_lens_enters_the_fusion_once(camera):
+    prediction = sphere(camera).prediction()
+    view = view_of(prediction)
+    entered = np.unique(view.table.cells)
+    entered = entered[entered != view.table.outside]
+    valid = np.flatnonzero(prediction.valid)
+    print(f"{camera.name}: {np.isin(valid, entered).mean():.2%} of the valid pixels enter")
+    assert np.isin(valid, entered).mean() >= 0.99
+    assert (view.weights[valid] > 0).all()
+
+
+@LENSES
+def test_a_direction_finds_its_pixel_or_the_one_beside_it_up_to_the_rim(camera):
+    """A cell is half a pixel wide: so nowhere is a direction further off than half a pixel and half a cell."""
+    rays, pixel = directions(camera)
+    found = view_of(sphere(camera).prediction()).table.look_up(*rays.T.astype(np.float32))
+    inside = found != camera.width * camera.height
+    assert inside.mean() > 0.995  # but for half a cell around the image
+    off = np.abs(np.stack(np.divmod(found[inside], camera.width)) - np.divmod(pixel[inside], camera.width))
+    assert off.max() <= 1 and (off.sum(0) == 0).mean() > 0.7
+
+
+@LENSES
+def test_a_direction_outside_the_image_finds_nothing(camera):
+    view = view_of(sphere(camera).prediction())
+    outside = np.array([[0, 0, -1.0], [0.1, 0, -1], [1, 1, -0.1], [-1, 0.5, -0.2]])
+    assert (view.table.look_up(*outside.T.astype(np.float32)) == view.table.outside).all()
+    assert view.weights[view.table.outside] == 0
+
+
+def test_rays_beyond_90_degrees_have_their_pixels():
+    """A table over directions ends at the back, not at a half space; here for a lens that sees 120 degrees aside."""
+
+    class Wide(type(FISHEYE)):
+        def unproject(self, pixels):
+            x, y = (np.asarray(pixels, float) / (self.width, self.height) * 2 - 1)[..., 0], pixels[..., 1] * 0
+            theta = np.radians(120) * x
+            return np.stack([np.sin(theta), y, np.cos(theta)], -1), np.ones(theta.shape, bool)
+
+        def project(self, points):
+            theta = np.degrees(np.arctan2(points[..., 0], points[..., 2])) / 120
+            side = np.abs(points[..., 1]) < 0.1
+            u = (theta + 1) / 2 * self.width
+            return np.stack([u, np.full_like(u, 0.5)], -1), (np.abs(theta) < 1) & side
+
+    camera = Wide(60, 1, *FISHEYE.params)
+    rays = camera.unproject(np.stack([np.arange(60) + 0.5, np.full(60, 0.5)], -1))[0]
+    found = view_of(DepthPrediction("1", np.ones((1, 60), np.float32), np.ones((1, 60), bool), camera, "wide")).table
+    assert rays[:, 2].min() < -0.45
+    np.testing.assert_array_equal(found.look_up(*rays.T.astype(np.float32)), np.arange(60))
+
+
+@LENSES
+def test_the_plane_of_a_pixel_is_that_of_the_scene(camera):
+    scene = slanted_plane(camera)
+    view = view_of(scene.prediction())
+    known = view.weights > 0
+    normal = -np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
+    assert known.sum() > 0.95 * scene.prediction().valid.sum()
+    assert np.quantile(np.abs(view.planes[known] - [*normal, 12.0]).max(1), 0.99) < 1e-3
+
+
+@pytest.mark.parametrize("scene", [sphere, cylinder], ids=lambda s: s.__name__)
+def test_normals_point_away_from_the_camera_and_points_lie_on_the_scene(scene):
+    seen = scene(FISHEYE)
+    view = view_of(seen.prediction())
+    known = np.flatnonzero(view.weights)
+    normals = -seen.normals[0].reshape(3, -1).numpy()[:, known]
+    assert np.median(np.abs(view.planes[known, :3].T - normals).max(0)) < 5e-3
+    expected = (seen.rays * seen.distance)[0].reshape(3, -1).numpy()[:, known]
+    np.testing.assert_allclose(view.points[:, known], expected, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose((view.planes[known, :3].T * expected).sum(0), view.planes[known, 3], rtol=1e-4)
 
 
 def test_colours_go_with_their_pixels():
     image = np.random.default_rng(0).random((90, 120, 3)).astype(np.float32)
-    (view,) = pinhole_views(sphere(PINHOLE).prediction(), image, RectifyConfig())
-    np.testing.assert_allclose(view.color, image, atol=2e-2)  # cv2 interpolates in steps of 1/32 pixel
+    view = surface_view(sphere(PINHOLE).prediction(), image, RectifyConfig())
+    np.testing.assert_allclose(view.colors[:-1, :3].reshape(90, 120, 3) / 255, image, atol=2.1e-3)
 
 
-def test_a_pinhole_finer_than_asked_is_reduced():
-    camera = PINHOLE.resized(480, 360)
-    (view,) = views(sphere(camera).prediction(), RectifyConfig(focal_px=70.0))
-    assert view.depth.shape == pytest.approx((90, 120), abs=3)
-    known = view.depth > 0
-    rays = np.linalg.inv(view.matrix) @ np.array([0.5, 0.5, 1])
-    assert known.all() and view.depth[0, 0] == pytest.approx(10 / np.linalg.norm(rays), rel=1e-3)
+@LENSES
+def test_a_finer_image_is_merged_and_no_pixel_is_lost_by_it(camera):
+    fine = camera.resized(3 * camera.width + 1, 3 * camera.height + 2)
+    scene = slanted_plane(fine)
+    view = view_of(scene.prediction(), RectifyConfig(focal_px=fine.focal_length / 3))
+    assert len(view.weights) == (camera.width + 1) * (camera.height + 1) + 1
+    known = view.weights > 0
+    normal = -np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
+    assert np.quantile(np.abs(view.points[:, known].T @ normal - 12), 0.99) < 0.01  # halved at the rim, still on it
+    rows, columns = np.nonzero(scene.prediction().valid)
+    of_pixel = rows // 3 * (camera.width + 1) + columns // 3
+    assert np.isin(of_pixel, view.table.cells).mean() > 0.99 and known[of_pixel].mean() > 0.98
 
 
-@pytest.mark.parametrize("camera", [FISHEYE, C3VD], ids=["fisheye", "c3vd"])
-def test_every_valid_pixel_s_direction_is_known_in_exactly_one_face(camera):
-    scene = sphere(camera)
-    faces = views(scene.prediction())
-    assert len(faces) == 5
-    inner = cv2.erode(np.pad(scene.valid[0, 0].numpy().astype(np.uint8), 1), np.ones((5, 5), np.uint8))[1:-1, 1:-1] > 0
-    rays = camera.rays()[0][inner]
-    depths = np.stack([looked_up(face, rays) for face in faces])
-    count = (depths > 0).sum(0)
-    assert (count == 1).mean() >= 0.99
-    assert (count > 1).mean() < 1e-3  # rounding, where a direction lies on the seam itself
+def test_a_pinhole_field_crops_a_fisheye_and_leaves_a_pinhole_whole():
+    def share(camera: CameraModel, field: str) -> float:
+        prediction = sphere(camera).prediction()
+        view = view_of(prediction, RectifyConfig(field=field))
+        return (view.weights > 0).sum() / prediction.valid.sum()
+
+    assert share(FISHEYE, "whole") == 1 and 0.4 < share(FISHEYE, "pinhole") < 0.7
+    assert share(PINHOLE, "pinhole") == 1
+    rays = FISHEYE.rays()[0]
+    kept = weights(view_of(sphere(FISHEYE).prediction(), RectifyConfig(field="pinhole")), FISHEYE) > 0
+    assert (rays[kept][:, 0] / rays[kept][:, 2]).max() == pytest.approx(60 / FISHEYE.focal_length, rel=0.05)
 
 
-@pytest.mark.parametrize("camera", [FISHEYE, C3VD], ids=["fisheye", "c3vd"])
-@pytest.mark.parametrize("scene", [sphere, cylinder], ids=lambda s: s.__name__)
-def test_depth_of_a_face_is_the_distance_of_the_scene_along_its_axis(camera, scene):
-    for view in views(scene(camera).prediction(), KEEP_ALL):
-        height, width = view.depth.shape
-        u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.matrix).T
-        norm = np.linalg.norm(rays, axis=-1)
-        in_cam = rays @ view.view_from_cam[:3, :3] / norm[..., None]
-        if scene is sphere:
-            expected = np.full(norm.shape, 10.0)
-        else:
-            expected = 8.0 / np.linalg.norm(in_cam[..., :2], axis=-1).clip(min=1e-6)
-        known = (view.depth > 0) & (expected < 40)
-        assert known.sum() > 500
-        np.testing.assert_allclose((view.depth * norm)[known], expected[known], rtol=0.02)
+def test_a_field_that_is_none_is_refused():
+    from lightdepth.errors import InputError
+
+    with pytest.raises(InputError, match="field 'half'; expected whole or pinhole"):
+        RectifyConfig(field="half")
 
 
 def test_nothing_beyond_the_given_distance_is_known():
-    scene = cylinder(FISHEYE)
-    near, far = (views(scene.prediction(), max_distance=m) for m in (20.0, np.inf))
-
-    def most(found):
-        return max(v.depth.max() for v in found)
-
-    assert most(near) <= 20 < most(far)
-    assert views(scene.prediction(), max_distance=1.0) == []
+    prediction = cylinder(FISHEYE).prediction()
+    near = view_of(prediction, max_distance=20.0)
+    known = near.weights > 0
+    assert 19 < np.linalg.norm(near.points[:, known], axis=0).max() <= 20.001
+    assert not view_of(prediction, max_distance=1.0).weights.any()
 
 
-def test_what_is_not_valid_reaches_no_view_and_does_not_leak_into_others():
+def test_what_is_not_valid_is_not_known_and_bends_no_plane_beside_it():
     prediction = sphere(FISHEYE).prediction()
     distance, valid = prediction.distance.copy(), prediction.valid.copy()
-    valid[60:100, 100:150] = False
-    distance[60:100, 100:150] = np.nan
-    known = np.concatenate([v.depth[v.depth > 0] for v in views(replace(prediction, distance=distance, valid=valid))])
-    whole = np.concatenate([v.depth[v.depth > 0] for v in views(prediction)])
-    assert np.isfinite(known).all() and 0.9 * len(whole) < len(known) < len(whole)
-    assert views(replace(prediction, valid=np.zeros_like(valid))) == []
+    valid[30:50, 50:75] = False
+    distance[30:50, 50:75] = np.nan
+    holed, whole = view_of(replace(prediction, distance=distance, valid=valid)), view_of(prediction)
+    known = holed.weights > 0
+    np.testing.assert_array_equal(known[:-1].reshape(valid.shape), valid)
+    np.testing.assert_allclose(holed.planes[known], whole.planes[known], atol=1e-2)
+    assert np.isfinite(holed.planes).all()
+    assert not view_of(replace(prediction, valid=np.zeros_like(valid))).weights.any()
 
 
 def step(camera: CameraModel, near: float = 10.0, far: float = 16.0) -> DepthPrediction:
@@ -130,32 +184,51 @@ def step(camera: CameraModel, near: float = 10.0, far: float = 16.0) -> DepthPre
 
 
 def test_both_sides_of_an_edge_are_left_out_and_nothing_else():
-    (view,) = views(step(PINHOLE), RectifyConfig(min_cosine=0.0))
-    assert not view.depth[5:-5, 59:61].any()
-    assert (view.depth[5:-5, 5:58] > 0).all() and (view.depth[5:-5, 62:-5] > 0).all()
-    (kept,) = views(step(PINHOLE), KEEP_ALL)
-    assert (kept.depth[5:-5, 5:-5] > 0).all()
+    weight = weights(view_of(step(PINHOLE)), PINHOLE)
+    assert not weight[5:-5, 59:61].any()
+    assert (weight[5:-5, 5:59] > 0).all() and (weight[5:-5, 61:-5] > 0).all()
+    kept = view_of(step(PINHOLE), RectifyConfig(max_slope=np.inf))
+    assert (weights(kept, PINHOLE)[5:-5, 5:-5] > 0).all()
 
 
-def test_grazing_pixels_are_left_out():
-    scene = slanted_plane(PINHOLE, normal=(1.0, 0.0, -0.35))
-    rays = scene.rays[0].permute(1, 2, 0).numpy()
-    cosine = -(scene.normals[0].permute(1, 2, 0).numpy() * rays).sum(-1)
-    (view,) = views(scene.prediction(), RectifyConfig(min_cosine=0.5, max_jump=np.inf))
-    inner = cv2.erode(scene.valid[0, 0].numpy().astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    assert inner[cosine < 0.48].sum() > 300 and inner[cosine > 0.52].sum() > 300  # or this would prove nothing
-    assert not view.depth[cosine < 0.48].any()
-    assert (view.depth[inner & (cosine > 0.52)] > 0).mean() > 0.99
+def test_an_edge_bends_no_plane_beside_it():
+    view = view_of(step(PINHOLE))
+    known = view.weights > 0
+    np.testing.assert_allclose(view.planes[known, 2], 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE], ids=["pinhole", "fisheye"])
-def test_there_is_no_curtain_between_two_planes(camera):
-    def between(config: RectifyConfig) -> float:
-        volume = TsdfVolume(0.25, FusionConfig())
-        for view in views(step(camera), config):
-            volume.integrate(view, np.eye(4))
-        z = volume.extract_mesh()[0][:, 2]
-        assert ((np.abs(z - 10) < 0.5).sum() > 500) and ((np.abs(z - 16) < 0.5).sum() > 500)
-        return float(((z > 11.5) & (z < 14.5)).mean())
+def test_an_edge_is_the_same_edge_at_any_image_size():
+    for camera in (PINHOLE.resized(60, 44), PINHOLE, PINHOLE.resized(240, 180)):
+        weight = weights(view_of(step(camera)), camera)
+        middle = camera.width // 2
+        assert not weight[10:-10, middle - 1 : middle + 1].any()
+        gentle = slanted_plane(camera, (1.0, 0.0, -0.2)).prediction()
+        assert weights(view_of(gentle), camera)[gentle.valid].min() > 0
 
-    assert between(RectifyConfig()) == 0
+
+def test_the_weight_falls_with_the_slant():
+    scene: Scene = slanted_plane(PINHOLE, normal=(1.0, 0.0, -0.35))
+    cosine = -(scene.normals * scene.rays)[0].sum(0).numpy()
+    valid = scene.prediction().valid
+    np.testing.assert_allclose(weights(view_of(scene.prediction()), PINHOLE)[valid], FULL * cosine[valid], atol=1.0)
+
+
+def test_dark_saturated_and_uncertain_pixels_weigh_little_and_are_not_lost():
+    prediction = sphere(PINHOLE).prediction()
+    image = np.full((90, 120, 3), 0.5, np.float32)
+    image[:, :30], image[:, 30:60] = 0.004, (1.0, 0.3, 0.2)
+    uncertain = np.full((90, 120), 1e-3, np.float32)
+    uncertain[:, 90:] = 0.15
+    view = surface_view(replace(prediction, uncertainty=uncertain), image, RectifyConfig())
+    weight = weights(view, PINHOLE) / FULL
+    assert weight[:, 60:90].min() > 0.99
+    assert weight[:, :30].min() > 0 and weight[:, :30].max() < 0.7
+    np.testing.assert_allclose(weight[:, 30:60], 0.5, atol=0.01)
+    np.testing.assert_allclose(weight[:, 90:], 0.5, atol=0.01)
+
+
+def test_the_light_s_weight_is_whole_between_its_limits():
+    config = RectifyConfig(dark=0.1, bright=0.9, unlit=0.2)
+    np.testing.assert_allclose(
+        light_weight(np.array([0, 0.05, 0.1, 0.5, 0.9, 0.95, 1]), config), [0.2, 0.6, 1, 1, 1, 0.6, 0.2]
+    )

@@ -1,0 +1,181 @@
+"""What of the wall was seen, how well, and what was not: confidence, weakly seen patches, holes.
+
+A vertex has been seen well when enough keyframes saw it with enough weight: a keyframe that looks straight at a lit
+wall counts 1; a slanted, dark, saturated or uncertain look counts less. A hole is a rim of the surface that runs around
+missing wall; the rims at the two ends of a piece of tube, and the outer rim of a patch, are not holes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from densify.dense_map import Contribution, DenseMap
+from densify.rectify import FULL, SurfaceView
+from lightdepth.prediction import DepthPrediction
+from lightdepth.sparse_map import Keyframe
+
+
+@dataclass(frozen=True)
+class CoverageConfig:
+    """When wall counts as seen well, and what is too small to mention."""
+
+    views: int = 3  # keyframes that saw it, at least
+    weight: float = 1.0  # their weights together, at least; 1 is one keyframe that nothing speaks against
+    min_voxels: float = 5.0  # patches and holes smaller than a square with this side, in voxels, are not listed
+
+
+@dataclass(frozen=True)
+class Region:
+    """A weakly seen patch or a hole: its area (unit²), middle (3,), and the number of the frame that is nearest to it
+    among those that look towards it."""
+
+    area: float
+    center: np.ndarray
+    frame: int
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Areas in the surface's unit²: all of it, the part seen well, and the listed patches and holes, largest first."""
+
+    area: float
+    well: float
+    weak: tuple[Region, ...]
+    holes: tuple[Region, ...]
+
+    @property
+    def well_share(self) -> float:
+        """Share of the wall, holes included, that was seen well."""
+        return self.well / max(self.area + self.hole_area, 1e-300)
+
+    @property
+    def hole_area(self) -> float:
+        return float(sum(h.area for h in self.holes))
+
+
+def triangle_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def coverage(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> Coverage:
+    """Of a dense map that knows the weights and views of its vertices, in the unit of the map."""
+    assert dense.weights is not None and dense.views is not None
+    areas = triangle_areas(dense.vertices, dense.triangles)
+    good = ((dense.views >= config.views) & (dense.weights >= config.weight))[dense.triangles].all(1)
+    least = (config.min_voxels * dense.voxel) ** 2
+    middles = dense.vertices[dense.triangles].mean(1)
+    weak = []
+    for patch in patches(dense.triangles, np.flatnonzero(~good)):
+        area = float(areas[patch].sum())
+        if area >= least:
+            center = np.average(middles[patch], axis=0, weights=areas[patch])
+            weak.append(Region(area, center, _frame_before(center, dense.submap.keyframes)))
+    holes = [
+        Region(area, center, _frame_before(center, dense.submap.keyframes))
+        for area, center in find_holes(dense.vertices, dense.triangles)
+        if area >= least
+    ]
+
+    def largest_first(regions: list[Region]) -> tuple[Region, ...]:
+        return tuple(sorted(regions, key=lambda r: -r.area))
+
+    return Coverage(float(areas.sum()), float(areas[good].sum()), largest_first(weak), largest_first(holes))
+
+
+def contribution(view: SurfaceView, prediction: DepthPrediction) -> Contribution:
+    """What a view gives to the fusion, of all pixels that its prediction calls valid."""
+    fused = view.weights[view.weights > 0]
+    merged = float(prediction.valid.size / (len(view.weights) - 1))
+    share = len(fused) * merged / max(int(prediction.valid.sum()), 1)
+    return Contribution(min(share, 1.0), float(fused.mean() / FULL) if len(fused) else 0.0)
+
+
+def looked_at(dense: DenseMap, keyframe: Keyframe, given: Contribution, stride: int = 8) -> Contribution:
+    """The contribution of a keyframe with what it looks at filled in, from every stride-th pixel each way."""
+    assert dense.confidence is not None and dense.views is not None
+    rays, valid = (a[stride // 2 :: stride, stride // 2 :: stride] for a in keyframe.camera.rays())
+    triangles = dense.surface.meet(keyframe.center, rays[valid] @ keyframe.cam_from_map[:3, :3])[1]
+    corners = dense.triangles[triangles[triangles >= 0]]
+    if not len(corners):
+        return given
+    return replace(given, confidence=float(dense.confidence[corners].mean()), views=float(dense.views[corners].mean()))
+
+
+def find_holes(vertices: np.ndarray, triangles: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Area and middle (3,) of each hole in a surface whose triangles turn their front to the cameras.
+
+    With A the area vector of a rim, run through with the surface on its left, and n the mean normal of the surface
+    along it: around missing wall, A points against n; at the outer rim of a patch, with it; and at the open end of a
+    tube the normals, which point inwards from all sides, cancel.
+    """
+    normals = _vertex_normals(vertices, triangles)
+    found = []
+    for rim in rims(triangles):
+        points, middle = vertices[rim], vertices[rim].mean(0)
+        spokes = points - middle
+        fans = 0.5 * np.cross(spokes, np.roll(spokes, -1, 0))
+        steps = np.linalg.norm(np.roll(points, -1, 0) - points, axis=1) + 1e-300
+        mean = np.average(normals[rim], axis=0, weights=steps)
+        if np.linalg.norm(mean) > 0.5 and fans.sum(0) @ mean < 0:
+            found.append((float(np.linalg.norm(fans, axis=1).sum()), middle))
+    return found
+
+
+def rims(triangles: np.ndarray) -> list[np.ndarray]:
+    """Closed loops of the edges that only one triangle has, each as vertices in the direction of its triangle."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+    count = int(triangles.max(initial=-1)) + 1
+    backward = np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])
+    following: dict[int, list[int]] = {}
+    for a, b in edges[~backward].tolist():
+        following.setdefault(a, []).append(b)
+    loops = []
+    while following:
+        start = vertex = next(iter(following))
+        loop = []
+        while vertex in following:
+            loop.append(vertex)
+            ends = following[vertex]
+            after = ends.pop()
+            if not ends:
+                del following[vertex]
+            vertex = after
+            if vertex == start:
+                break
+        if len(loop) > 2:
+            loops.append(np.array(loop))
+    return loops
+
+
+def _vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, triangles[:, corner], np.cross(b - a, c - a))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+
+
+def patches(triangles: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
+    """Some rows of triangles (m, 3), one array for each part that hangs together by vertices."""
+    if not len(rows):
+        return []
+    corners = triangles[rows]
+    count = int(triangles.max()) + 1
+    pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]]])
+    graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (count, count))
+    part = connected_components(graph, directed=False)[1][corners[:, 0]]
+    order = np.argsort(part, kind="stable")
+    return np.split(rows[order], np.flatnonzero(np.diff(part[order])) + 1)
+
+
+def _frame_before(point: np.ndarray, keyframes: Sequence[Keyframe]) -> int:
+    """The frame whose camera is nearest to a point in front of it; the nearest of all where none looks that way."""
+    distance = np.array([np.linalg.norm(k.center - point) for k in keyframes])
+    behind = np.array([k.in_camera(point[None])[0, 2] <= 0 for k in keyframes])
+    return keyframes[int(np.argmin(distance + np.where(behind & ~behind.all(), distance.max() + 1, 0)))].number
