@@ -1,7 +1,9 @@
-"""The verbs of densify: demo, doctor, sparse, densify, evaluate. Thin: arguments in, files out."""
+"""The verbs of densify: demo, doctor, sparse, densify, evaluate, measure. Thin: arguments in, files out."""
 
 from __future__ import annotations
 
+import json
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -11,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from densify.alignment import AlignmentConfig
+from densify.coverage import CoverageConfig
 from densify.doctor import examine
 from densify.fusion import FusionConfig
 from densify.judge import (
@@ -30,6 +33,7 @@ from densify.judge import (
     with_trajectories,
     withheld_errors,
 )
+from densify.measure import chosen_map, measured, places_in_frame, run_unit, summary
 from densify.page import Gallery, densify_page
 from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, fitted_to_frames
 from densify.pipeline import densify as densify_maps
@@ -70,6 +74,7 @@ def densify(
     alignment: AlignmentConfig = AlignmentConfig(),
     rectify: RectifyConfig = RectifyConfig(),
     fusion: FusionConfig = FusionConfig(),
+    coverage: CoverageConfig = CoverageConfig(),
     sfm: SfmConfig = SfmConfig(),
     formats: tuple[str, ...] = ("ply",),
     mm_per_unit: float | None = None,
@@ -92,6 +97,7 @@ def densify(
         alignment: when a keyframe's scale is found and trusted
         rectify: which predicted pixels are fused, and how finely
         fusion: resolution and reach of the surface
+        coverage: when wall counts as seen well
         sfm: how frames are mapped when there is no map
         formats: of the mesh: ply, glb, obj
         mm_per_unit: millimetres per map unit, where known; lengths are then written in mm
@@ -104,7 +110,7 @@ def densify(
         raise InputError(f"--formats {list(formats)}; expected ply, and besides it glb and obj if wanted")
     if mm_per_unit is not None and not mm_per_unit > 0:
         raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
-    config = DensifyConfig(alignment, rectify, fusion, withhold, seed)
+    config = DensifyConfig(alignment, rectify, fusion, withhold, seed, coverage)
     model = load_model(checkpoint, details=False)  # before minutes are spent on a sparse map
     with run_folder(output, "densify", arguments, overwrite) as run:
         sparse_map, frames = _map_and_frames(run, data, map, format, camera, light, mask, sfm)
@@ -122,7 +128,7 @@ def densify(
                 f"Map {', '.join(weak)} came without observations: which points a keyframe saw was guessed by "
                 "projection, so scales and inliers rest on weaker ground."
             )
-        page = densify_page("Densified maps", work.results, work.baselines, work.gallery, notes)
+        page = densify_page("Densified maps", work.results, work.baselines, work.gallery, notes, None, mm_per_unit)
         page.write(run.folder / "report.html")
         run.log(f"{output}/report.html")
 
@@ -274,6 +280,46 @@ def _made_dense(
     return [dense.get(m.trajectory.id, m) for m in sparse_models(sparse_map)], withheld
 
 
+def measure(
+    run: Path,
+    points: list[tuple[float, float, float]] | None = None,
+    frame: int | None = None,
+    pixels: list[tuple[float, float]] | None = None,
+    radius: float | None = None,
+    map: int | None = None,
+    mm_per_unit: float | None = None,
+    output: Path | None = None,
+) -> None:
+    """Lengths and areas on a surface of a densify run: between two places, around one, inside an outline of more.
+
+    Args:
+        run: folder made by densify
+        points: places on the surface, [[x, y, z], ...], in its unit
+        frame: number of the keyframe that pixels are given in
+        pixels: places as pixels of that keyframe, [[u, v], ...], first centre at (0.5, 0.5), instead of points
+        radius: with one place, of the disc of wall around it
+        map: number of the map; needed where the run has several
+        mm_per_unit: millimetres per unit of the surface, where the run did not know it
+        output: JSON file to write besides
+    """
+    dense = chosen_map(read_run(run), map, run)
+    unit = run_unit(run, mm_per_unit)
+    if (points is None) == (pixels is None) or (pixels is None) != (frame is None):
+        raise InputError("give the places either by --points, or by --frame and --pixels")
+    if points is not None:
+        places = np.asarray(points, float).reshape(-1, 3)
+    else:
+        assert frame is not None and pixels is not None
+        places = places_in_frame(dense, frame, np.asarray(pixels, float).reshape(-1, 2))
+    found = measured(dense, places, radius, mm_per_unit or 1.0)
+    result = {"run": str(run), "map": dense.id, "unit": unit, **found}
+    print(summary(found, unit))
+    if output is not None:
+        partial = output.with_name(f"{output.name}.partial")
+        partial.write_text(json.dumps(plain(result), indent=1) + "\n")
+        os.replace(partial, output)
+
+
 def demo(
     output: Path = Path("runs/demo"),
     checkpoint: str = DEFAULT_CHECKPOINT,
@@ -381,6 +427,7 @@ class Densified:
                     "vertices": len(dense.vertices),
                     "voxel": dense.voxel,
                     "seen_share": result.seen_share,
+                    "coverage": result.coverage and result.coverage.scaled(mm_per_unit or 1.0).record(),
                     "withheld": withheld and asdict(withheld),
                     "withheld_constant": baseline and baseline.withheld and asdict(baseline.withheld),
                     "seconds": result.seconds,
@@ -398,6 +445,8 @@ class Densified:
                 text += f"; withheld points {_share(withheld.median)} from the surface"
                 if baseline is not None and baseline.withheld is not None:
                     text += f" (constant distance {_share(baseline.withheld.median)})"
+            if result.coverage is not None:
+                text += f"; {result.coverage.well_share:.0%} of the wall seen well, {len(result.coverage.holes)} holes"
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
         run.record.update(
             {"unit": "mm" if mm_per_unit else "map units", "checkpoint": self.model, "maps": plain(records)}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -53,6 +54,23 @@ class Coverage:
         """Share of the wall, holes included, that was seen well."""
         return self.well / max(self.area + self.hole_area, 1e-300)
 
+    def scaled(self, scale: float) -> Coverage:
+        """The same in another unit."""
+
+        def of(regions: tuple[Region, ...]) -> tuple[Region, ...]:
+            return tuple(Region(r.area * scale**2, r.center * scale, r.frame) for r in regions)
+
+        return Coverage(self.area * scale**2, self.well * scale**2, of(self.weak), of(self.holes))
+
+    def record(self) -> dict[str, Any]:
+        """For run.json: areas, shares, and every listed region with its place and frame."""
+        regions = {
+            name: [{"area": r.area, "center": r.center.tolist(), "frame": r.frame} for r in found]
+            for name, found in (("weak", self.weak), ("holes", self.holes))
+        }
+        areas = {"area": self.area, "well_area": self.well, "hole_area": self.hole_area, "well_share": self.well_share}
+        return {**areas, **regions}
+
     @property
     def hole_area(self) -> float:
         return float(sum(h.area for h in self.holes))
@@ -63,11 +81,16 @@ def triangle_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
+def seen_well(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> np.ndarray:
+    """Which vertices (n,) were seen well."""
+    assert dense.weights is not None and dense.views is not None
+    return (dense.views >= config.views) & (dense.weights >= config.weight)
+
+
 def coverage(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> Coverage:
     """Of a dense map that knows the weights and views of its vertices, in the unit of the map."""
-    assert dense.weights is not None and dense.views is not None
     areas = triangle_areas(dense.vertices, dense.triangles)
-    good = ((dense.views >= config.views) & (dense.weights >= config.weight))[dense.triangles].all(1)
+    good = seen_well(dense, config)[dense.triangles].all(1)
     least = (config.min_voxels * dense.voxel) ** 2
     middles = dense.vertices[dense.triangles].mean(1)
     weak = []

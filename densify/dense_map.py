@@ -205,8 +205,8 @@ def read_dense_map(folder: Path) -> DenseMapFiles:
     triangles = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), int)
     numbers, poses = read_tum(folder / "trajectory.tum")
     # trimesh keeps what it has no name for in the raw file: a structured array, or a dict of columns
-    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data") if len(triangles) else None
-    names = () if raw is None else getattr(getattr(raw, "dtype", None), "names", None) or tuple(raw)
+    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {}) if len(triangles) else {}
+    names = raw.dtype.names if isinstance(raw, np.ndarray) else tuple(raw)
     own = {name: np.asarray(raw[name]).ravel() if name in names else None for name in ("confidence", "views")}
     return DenseMapFiles(
         id=int(map_id),

@@ -86,7 +86,7 @@ class TsdfVolume:
         if not len(blocks):
             return set()
         self.views += sign
-        keys: list[Block] = list(map(tuple, blocks.tolist()))
+        keys: list[Block] = [(x, y, z) for x, y, z in blocks.tolist()]
         rows = np.array([self._row(key) for key in keys], int)
         rotation, translation = cam_from_map[:3, :3], cam_from_map[:3, 3]
         corners = (blocks * (BLOCK * self.voxel) @ rotation.T + translation).astype(np.float32)
@@ -170,7 +170,7 @@ class TsdfVolume:
         needed = wanted if blocks is None else {_moved(b, c) for b in wanted for c in CORNERS.tolist()} & self.blocks
         places = np.array(sorted(needed), np.int64).reshape(-1, 3)
         shape = (len(places), BLOCK, BLOCK, BLOCK)
-        keys: list[Block] = list(map(tuple, places.tolist()))
+        keys: list[Block] = [(x, y, z) for x, y, z in places.tolist()]
         rows = np.array([self._rows[key] for key in keys], int)
         weight, seen = self._weight[rows], self._seen[rows]
         known = (weight > 0) & (seen >= self._config.min_views)

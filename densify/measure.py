@@ -7,16 +7,21 @@ All lengths are in the surface's own unit; areas in its square.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from densify.coverage import patches, triangle_areas
-from densify.dense_map import Surface
+from densify.dense_map import DenseMapFiles, Surface
+from lightdepth.calibration import read_json
 from lightdepth.errors import InputError
+from lightdepth.report import number
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +78,8 @@ def _unfolded(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tup
 
 
 @dataclass(frozen=True)
-class Path:
-    """A way along the wall: points (n, 3) on it, its length, that of the straight line between its ends, and the length
+class Way:
+    """A path along the wall: points (n, 3) on it, its length, that of the straight line between its ends, and the length
     of those parts of it that cross a hole."""
 
     points: np.ndarray
@@ -106,7 +111,7 @@ def on_wall(wall: Wall, points: np.ndarray, reach: float = 5.0) -> np.ndarray:
     return found
 
 
-def path(wall: Wall, start: np.ndarray, end: np.ndarray) -> Path:
+def path(wall: Wall, start: np.ndarray, end: np.ndarray) -> Way:
     """The shortest way along the wall between two points (3,) on it. Raises InputError when there is none."""
     ends = np.stack([start, end])
     triangles = wall.surface.closest(ends)[1]
@@ -125,7 +130,7 @@ def path(wall: Wall, start: np.ndarray, end: np.ndarray) -> Path:
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     middles = 0.5 * (points[1:] + points[:-1])
     gap = np.linalg.norm(wall.surface.closest(middles)[0] - middles, axis=1) > wall.step
-    return Path(points, float(steps.sum()), float(np.linalg.norm(end - start)), float(steps[gap].sum()))
+    return Way(points, float(steps.sum()), float(np.linalg.norm(end - start)), float(steps[gap].sum()))
 
 
 def _nearest(wall: Wall, triangle: int, point: np.ndarray) -> int:
@@ -169,7 +174,7 @@ def patch(wall: Wall, corners: np.ndarray) -> Area:
     outline = np.concatenate([p.points[:-1] for p in parts])
     middle = outline.mean(0)
     _, extent, axes = np.linalg.svd(outline - middle, full_matrices=False)
-    if extent[1] < 1e-3 * extent[0]:
+    if extent[1] < 0.01 * extent[0]:
         raise InputError(f"the {len(corners)} corners lie on a line; an area needs corners around it")
     flat = (outline - middle) @ axes[:2].T
     reach = np.linalg.norm(outline - middle, axis=1).max()
@@ -208,3 +213,101 @@ def _area(wall: Wall, beyond: np.ndarray, seeds: np.ndarray) -> Area:
     share = np.where(high <= 0, 1.0, np.where(mid <= 0, two, one))
     areas = triangle_areas(wall.vertices, wall.triangles[chosen])
     return Area(float((areas * share).sum()), chosen)
+
+
+def chosen_map(maps: Sequence[DenseMapFiles], wanted: int | None, run: Path) -> DenseMapFiles:
+    """The map of that number, or the only one. Raises InputError where there is none, or no telling which."""
+    ids = [m.id for m in maps]
+    if wanted is None and len(maps) > 1:
+        raise InputError(f"{run}: it has maps {ids}, each in a frame of its own; say which by --map")
+    found = [m for m in maps if wanted in (None, m.id)]
+    if not found:
+        raise InputError(f"{run}: no map {wanted}; it has {ids}")
+    return found[0]
+
+
+def run_unit(run: Path, mm_per_unit: float | None) -> str:
+    """The unit of lengths: mm where the run knew it or mm_per_unit says it, else map units, which mean nothing outside.
+
+    Raises InputError where both say it.
+    """
+    unit = str(read_json(run / "run.json").get("unit", "map units"))
+    if mm_per_unit is None:
+        return unit
+    if not mm_per_unit > 0 or not np.isfinite(mm_per_unit):
+        raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
+    if unit == "mm":
+        raise InputError(f"{run}: its surfaces are in mm already; leave --mm-per-unit out")
+    return "mm"
+
+
+def places_in_frame(dense: DenseMapFiles, frame: int, pixels: np.ndarray) -> np.ndarray:
+    """The places (n, 3) of the surface in pixels (n, 2) of a keyframe. Raises InputError where one shows none."""
+    row = np.flatnonzero(dense.numbers == frame)
+    if not len(row):
+        near = dense.numbers[np.abs(dense.numbers - frame).argmin()]
+        raise InputError(f"map {dense.id}: frame {frame} is no keyframe of it; the nearest is {near}")
+    pose = dense.map_from_cam[row[0]]
+    rays, valid = dense.camera.unproject(pixels)
+    inside = valid & (pixels >= 0).all(1) & (pixels <= (dense.camera.width, dense.camera.height)).all(1)
+    distance = Surface(dense.vertices, dense.triangles).cast(pose[:3, 3], rays @ pose[:3, :3].T)
+    for what, bad in (("is outside the image", ~inside), ("sees no surface", ~np.isfinite(distance))):
+        if bad.any():
+            raise InputError(f"frame {frame}: pixel {pixels[bad][0].tolist()} {what}")
+    return pose[:3, 3] + distance[:, None] * (rays @ pose[:3, :3].T)
+
+
+def measured(
+    dense: DenseMapFiles, places: np.ndarray, radius: float | None = None, scale: float = 1.0
+) -> dict[str, Any]:
+    """What one place and a radius (an area), two places (a length), or an outline of more (both) measure.
+
+    `scale` multiplies lengths at the end; radius is in the scaled unit. Raises InputError for anything else.
+    """
+    if not np.isfinite(places).all():
+        raise InputError(f"places {places.tolist()}; expected finite numbers")
+    if (len(places) == 1) != (radius is not None):
+        raise InputError(
+            f"{len(places)} places{'' if radius is None else ' and a radius'}; expected one place with a "
+            "radius, two places, or the three or more corners of an outline"
+        )
+    if radius is not None and not (radius > 0 and np.isfinite(radius)):
+        raise InputError(f"--radius {radius}; expected a positive length")
+    wall = Wall(dense.vertices, dense.triangles)
+    places = on_wall(wall, places)
+    result: dict[str, Any] = {"places": (places * scale).tolist()}
+    if len(places) == 2:
+        way = path(wall, *places)
+        triangles = wall.surface.closest(way.points)[1]
+        result |= {"length": way.length * scale, "straight": way.straight * scale, "over_holes": way.over_holes * scale}
+    else:
+        found = disc(wall, places[0], radius / scale) if radius is not None else patch(wall, places)
+        triangles = found.triangles
+        result["area"] = found.area * scale**2
+        result["outline"] = None if found.outline is None else found.outline * scale
+    if dense.confidence is not None and dense.views is not None and len(triangles):
+        seen = dense.triangles[triangles]
+        result["least_confidence"], result["least_views"] = (
+            float(dense.confidence[seen].min()),
+            int(dense.views[seen].min()),
+        )
+    return result
+
+
+def summary(found: dict[str, Any], unit: str) -> str:
+    """What was measured, for people."""
+    if "length" in found:
+        text = f"along the surface {number(found['length'])} {unit}, straight {number(found['straight'])} {unit}"
+        if found["over_holes"] > 0:
+            text += f"; {number(found['over_holes'])} {unit} of it over holes"
+    else:
+        text = f"area {number(found['area'])} {unit}²"
+        if found["outline"] is not None:
+            text += f", outline {number(found['outline'])} {unit}"
+    if "least_views" in found:
+        text += (
+            f"; seen by {found['least_views']} keyframes or more, confidence {found['least_confidence']:.2f} or more"
+        )
+    if unit != "mm":
+        text += ". A map has no size of its own: --mm-per-unit gives it one"
+    return text

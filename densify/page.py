@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from densify.coverage import seen_well
 from densify.dense_map import DenseMap
 from densify.pipeline import KeyframeView, SubmapResult
 from lightdepth.figures import (
@@ -23,6 +24,8 @@ from lightdepth.figures import (
 )
 from lightdepth.report import Report, number
 from lightdepth.sparse_map import SparseMap
+
+SEEN_WELL, SEEN_WEAKLY = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15)
 
 
 class Gallery:
@@ -65,8 +68,10 @@ def densify_page(
     gallery: Gallery,
     notes: Sequence[str],
     evaluation: Mapping[str, Any] | None = None,
+    mm_per_unit: float | None = None,
 ) -> Report:
-    """The whole page. `baselines` are the same maps densified with a constant distance, or nothing."""
+    """The whole page. `baselines` are the same maps densified with a constant distance, or nothing; areas are in mm²
+    where the unit of the maps is known."""
     page = Report(title)
     for note in notes:
         page.text(note)
@@ -89,6 +94,8 @@ def densify_page(
         "pixels that see surface",
     ]
     page.table(headers, rows)
+    if any(r.coverage for r in results):
+        _coverage(page, results, mm_per_unit)
     if any(r.withheld for r in results):
         _withheld(page, results, baselines)
     for result in results:
@@ -120,6 +127,39 @@ def _errors(page: Report, evaluation: Mapping[str, Any]) -> None:
                 where = f"map {entry['map']} (ATE {number(entry['rms_ate_mm'])} mm)"
                 rows.append([where, name, found["points"], found["rms_mm"], found["median_mm"]])
     page.table(["", "model", "points", "RMS", "median"], rows)
+
+
+def _coverage(page: Report, results: Sequence[SubmapResult], mm_per_unit: float | None) -> None:
+    page.heading("Coverage")
+    page.text(
+        "Which part of the wall was seen well: by enough keyframes, not too slanted, neither clipped nor in the dark. "
+        "Holes are wall that nothing saw, with surface around them; the open ends of a piece of tube are none. "
+        "The frame is the one to look at again."
+    )
+    unit = "mm²" if mm_per_unit else "map units²"
+    rows, regions = [], []
+    for result in results:
+        if result.coverage is None:
+            continue
+        name, c = f"map {result.dense.submap.id}", result.coverage.scaled(mm_per_unit or 1.0)
+        rows.append(
+            [name, c.area, 100 * c.well_share, len(c.weak), sum(r.area for r in c.weak), len(c.holes), c.hole_area]
+        )
+        kinds = [("hole", r) for r in c.holes[:5]] + [("seen weakly", r) for r in c.weak[:5]]
+        regions += [[name, kind, r.area, r.frame] for kind, r in kinds]
+    headers = [
+        "",
+        f"surface [{unit}]",
+        "seen well [%]",
+        "weak patches",
+        f"their area [{unit}]",
+        "holes",
+        f"their area [{unit}]",
+    ]
+    page.table(headers, rows)
+    if regions:
+        page.text("The largest of each kind:")
+        page.table(["", "", f"area [{unit}]", "frame"], regions)
 
 
 def _withheld(page: Report, results: Sequence[SubmapResult], baselines: Sequence[SubmapResult]) -> None:
@@ -161,7 +201,13 @@ def mesh_pictures(dense: DenseMap) -> list[tuple[bytes, str]]:
     keyframes = dense.submap.keyframes
     middle = keyframes[len(keyframes) // 2]
     inside = mesh_picture(*surface, origin=middle.center, axes=middle.cam_from_map[:3, :3])
-    return [*pictures, (png(inside), f"… and from keyframe {middle.name}")]
+    pictures.append((png(inside), f"… and from keyframe {middle.name}"))
+    if dense.weights is not None:
+        colors = np.where(seen_well(dense)[:, None], SEEN_WELL, SEEN_WEAKLY)
+        pictures.append(
+            (png(mesh_picture(dense.vertices, dense.triangles, colors)), "Seen well (green), weakly (orange)")
+        )
+    return pictures
 
 
 def _scale_chart(dense: DenseMap) -> bytes:
