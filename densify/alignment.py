@@ -3,16 +3,21 @@
 After "3D Densification for Multi-Map Monocular VSLAM in Endoscopy", System Overview, with two corrections: norms are
 taken in the camera frame of the keyframe (the paper prints world-frame norms, which pull the scale to 1 where the
 camera is away from the origin), and a point is an inlier where its residual is at most t sigma (the paper prints >=).
+
+Notation: a mapped, b predicted distance of a point; s the scale; the ratios a / b are the proposals for it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from densify.bending import Bend
+from lightdepth.errors import InputError
 from lightdepth.observations import ObservedDistances
-from lightdepth.robust import inlier_sigma, lmeds_scale, refine_scale
+from lightdepth.prediction import DepthPrediction
+from lightdepth.robust import Loss, inlier_sigma, lmeds_scale, refine_scale
 
 
 @dataclass(frozen=True)
@@ -22,17 +27,26 @@ class AlignmentConfig:
     t: float = 2.5  # a residual of at most t sigma makes an inlier
     finite_sample: bool = False  # Rousseeuw's factor 1 + 5 / (n - 1) in sigma
     refine: bool = True  # robust refinement on the inliers
+    loss: Loss = "geman_mcclure"  # of the refinement: geman_mcclure, huber, cauchy or tukey
     min_points: int = 8  # observed points with a prediction; fewer are not worth a scale
+    min_inliers: int = 6  # points within t sigma
     min_inlier_share: float = 0.5  # of the observed points
     max_relative_sigma: float = 0.35  # sigma over the median mapped distance
+    min_spread_deg: float = 3.0  # root mean square angle between the inliers' rays and their mean
+    min_distance_spread: float = 0.02  # standard deviation of the inliers' log distance
+    max_second_mode: float = 0.6  # points that agree on another scale, over those that agree on this one
+
+    def __post_init__(self) -> None:
+        if not self.t > 0:
+            raise InputError(f"alignment.t {self.t}; expected a positive number of sigmas, such as 2.5")
 
 
 @dataclass(frozen=True)
 class Alignment:
     """map distance ≈ scale · predicted distance. sigma in map units; ids of the points on either side of t sigma.
 
-    `ok`, or else `reason` says why the keyframe is left out. `range_90` is the 90th percentile of the inliers'
-    distance.
+    `ok`, or else `reason` says why the keyframe is left out. `range_90` is the 90th percentile of the distance of the
+    LMedS inliers. `bend` is the smooth field that the depth is bent by, where there is one.
     """
 
     keyframe: str
@@ -43,6 +57,7 @@ class Alignment:
     outlier_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     range_90: float = 0.0
     reason: str = ""
+    bend: Bend | None = None
 
     @property
     def ok(self) -> bool:
@@ -51,6 +66,10 @@ class Alignment:
     @property
     def inlier_share(self) -> float:
         return len(self.inlier_ids) / max(self.points, 1)
+
+    def applied(self, prediction: DepthPrediction) -> DepthPrediction:
+        """The prediction in map units."""
+        return prediction.scaled(self.scale) if self.bend is None else self.bend.applied(prediction)
 
 
 def align(name: str, observed: ObservedDistances, config: AlignmentConfig) -> Alignment:
@@ -66,15 +85,8 @@ def align(name: str, observed: ObservedDistances, config: AlignmentConfig) -> Al
     threshold = config.t * sigma + 1e-9 * float(np.median(a))
     inlier = np.abs(a - scale * b) <= threshold
     if config.refine:
-        scale = refine_scale(a[inlier], b[inlier], scale, max(sigma, 1e-12))
-    reason = ""
-    if inlier.mean() < config.min_inlier_share:
-        reason = f"{inlier.mean():.0%} of {n} points are inliers; at least {config.min_inlier_share:.0%}"
-    elif sigma > config.max_relative_sigma * np.median(a):
-        reason = f"sigma is {sigma / np.median(a):.0%} of the median distance; at most {config.max_relative_sigma:.0%}"
-    elif not scale > 0:
-        reason = f"scale {scale:.3g}; it must be positive"
-    return Alignment(
+        scale = refine_scale(a[inlier], b[inlier], scale, max(sigma, 1e-12), loss=config.loss)
+    found = Alignment(
         name,
         scale=scale,
         sigma=sigma,
@@ -82,5 +94,77 @@ def align(name: str, observed: ObservedDistances, config: AlignmentConfig) -> Al
         inlier_ids=observed.point_ids[inlier],
         outlier_ids=observed.point_ids[~inlier],
         range_90=float(np.quantile(a[inlier], 0.9)) if inlier.any() else 0.0,
-        reason=reason,
     )
+    return replace(found, reason=distrust(found, observed, inlier, config))
+
+
+def bent(alignment: Alignment, bend: Bend, observed: ObservedDistances, config: AlignmentConfig) -> Alignment:
+    """The alignment with a bend, and the points judged again: inliers within t sigma of the log residuals."""
+    residual = np.abs(np.log(observed.mapped / observed.predicted) - bend.at(observed.pixels, observed.predicted))
+    sigma = inlier_sigma(float(np.median(residual)), len(residual), config.finite_sample)
+    inlier = residual <= config.t * sigma + 1e-9
+    found = replace(
+        alignment,
+        scale=bend.scale,
+        sigma=sigma * float(np.median(observed.mapped)),
+        inlier_ids=observed.point_ids[inlier],
+        outlier_ids=observed.point_ids[~inlier],
+        bend=bend,
+    )
+    predicted = observed.predicted * np.exp(bend.at(observed.pixels, observed.predicted))
+    judged = replace(found, scale=1.0), replace(observed, predicted=predicted)
+    return replace(found, reason=distrust(*judged, inlier, config))
+
+
+def distrust(found: Alignment, observed: ObservedDistances, inlier: np.ndarray, config: AlignmentConfig) -> str:
+    """Why a scale does not deserve trust; empty where it does."""
+    a, n, relative = observed.mapped, len(observed), found.sigma / float(np.median(observed.mapped))
+    if inlier.sum() < config.min_inliers:
+        return f"{inlier.sum()} inliers of {n} points; at least {config.min_inliers}"
+    if inlier.mean() < config.min_inlier_share:
+        return f"{inlier.mean():.0%} of {n} points are inliers; at least {config.min_inlier_share:.0%}"
+    if relative > config.max_relative_sigma:
+        return f"sigma is {relative:.0%} of the median distance; at most {config.max_relative_sigma:.0%}"
+    if not (np.isfinite(found.scale) and found.scale > 0):
+        return f"scale {found.scale:.3g}; it must be positive"
+    spread = spread_deg(observed.rays[inlier])
+    if spread < config.min_spread_deg:
+        return f"the inliers fill {spread:.2g} degrees of the view; at least {config.min_spread_deg:g}"
+    deviation = float(np.log(a[inlier]).std())
+    if deviation < config.min_distance_spread:
+        return (
+            f"the inliers' distances deviate by {deviation:.1%}, so nothing tells how the depth does at others; "
+            f"at least {config.min_distance_spread:.1%}"
+        )
+    factor, share, own = second_mode(observed, found.scale, config.t * found.sigma)
+    if share > config.max_second_mode * own:
+        return (
+            f"two scales: {share:.0%} of {n} points agree on {factor:.3g} times the scale that {own:.0%} agree on; "
+            "one of the two groups is wrong, and nothing tells which"
+        )
+    return ""
+
+
+def spread_deg(rays: np.ndarray) -> float:
+    """Root mean square angle between unit rays (n, 3) and their mean, degrees."""
+    mean = rays.mean(0)
+    cosine = rays @ mean / max(float(np.linalg.norm(mean)), 1e-12)
+    return float(np.degrees(np.sqrt((np.arccos(np.clip(cosine, -1, 1)) ** 2).mean())))
+
+
+def second_mode(observed: ObservedDistances, scale: float, reach: float) -> tuple[float, float, float]:
+    """Another scale that points agree on: its factor to `scale`, the share of points around it, the share around scale.
+
+    LMedS breaks without a sign where half of the points agree on a wrong scale, so a rival is looked for: the densest
+    window of log(a / b) apart from the one around `scale`, both as wide as `reach` [map units] is at the median
+    distance. With no such window the factor is 1 and its share 0.
+    """
+    log_ratio = np.sort(np.log(observed.mapped / observed.predicted / scale))
+    half = float(np.clip(reach / np.median(observed.mapped), 0.02, 0.25))
+    inside = np.searchsorted(log_ratio, log_ratio + half, "right") - np.searchsorted(log_ratio, log_ratio - half)
+    own = float((np.abs(log_ratio) <= half).mean())
+    apart = np.abs(log_ratio) > 2 * half
+    if not apart.any():
+        return 1.0, 0.0, own
+    best = int(np.argmax(np.where(apart, inside, 0)))
+    return float(np.exp(log_ratio[best])), float(inside[best] / len(log_ratio)), own

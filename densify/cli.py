@@ -8,11 +8,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from densify.agreement import AgreementConfig
 from densify.alignment import AlignmentConfig
+from densify.bending import BendingConfig
+from densify.contradiction import ContradictionConfig
 from densify.coverage import CoverageConfig
 from densify.doctor import examine
 from densify.fusion import FusionConfig
@@ -71,7 +74,11 @@ def densify(
     mask: Path | None = None,
     withhold: float = 0.2,
     seed: int = 0,
+    recipe: Literal["full", "paper"] = "full",
     alignment: AlignmentConfig = AlignmentConfig(),
+    agreement: AgreementConfig = AgreementConfig(),
+    bending: BendingConfig = BendingConfig(),
+    contradiction: ContradictionConfig = ContradictionConfig(),
     rectify: RectifyConfig = RectifyConfig(),
     fusion: FusionConfig = FusionConfig(),
     coverage: CoverageConfig = CoverageConfig(),
@@ -94,7 +101,11 @@ def densify(
         mask: image, white where tissue shows
         withhold: share of each keyframe's observed points kept out of the alignment, to judge the surface by
         seed: draws the withheld points
+        recipe: full, or paper: one LMedS scale per keyframe, one undistorted pinhole image, plain TSDF
         alignment: when a keyframe's scale is found and trusted
+        agreement: how the keyframes of a submap are aligned together (full; --agreement.overlap 0 switches overlap off)
+        bending: how depth may bend (full; --bending.on false switches it off)
+        contradiction: pixels that nearer keyframes contradict (full; --contradiction.on false keeps them)
         rectify: which predicted pixels are fused, and how finely
         fusion: resolution and reach of the surface
         coverage: when wall counts as seen well
@@ -110,7 +121,9 @@ def densify(
         raise InputError(f"--formats {list(formats)}; expected ply, and besides it glb and obj if wanted")
     if mm_per_unit is not None and not mm_per_unit > 0:
         raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
-    config = DensifyConfig(alignment, rectify, fusion, withhold, seed, coverage)
+    config = DensifyConfig(
+        alignment, rectify, fusion, withhold, seed, recipe, agreement, bending, contradiction, coverage
+    )
     model = load_model(checkpoint, details=False)  # before minutes are spent on a sparse map
     with run_folder(output, "densify", arguments, overwrite) as run:
         sparse_map, frames = _map_and_frames(run, data, map, format, camera, light, mask, sfm)

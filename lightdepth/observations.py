@@ -33,8 +33,8 @@ def observed_distances(keyframe: Keyframe, submap: Submap, prediction: DepthPred
     """Pairs of mapped and predicted distance at the projections of the points that the keyframe observed.
 
     The prediction is sampled at the projection of the point, not at the detected keypoint: so both distances lie on one
-    ray, and their 3-D difference is exactly |mapped - s predicted|. Points behind the camera, outside the image, or
-    where the prediction is not valid take no part.
+    ray, and their 3-D difference is exactly |mapped - s predicted|. Points behind the camera, outside the image,
+    where the prediction is not valid, or whose ratio of distances is zero or infinite take no part.
     """
     check_image_size(prediction.name, prediction.camera.width, prediction.camera.height, keyframe.camera)
     ids, points, _ = submap.observed_points(keyframe)
@@ -42,9 +42,27 @@ def observed_distances(keyframe: Keyframe, submap: Submap, prediction: DepthPred
     pixels, seen = keyframe.camera.project(in_camera)
     predicted, valid = sample_distance(prediction, pixels)
     mapped = np.linalg.norm(in_camera, axis=1)
-    use = seen & valid & (mapped > 0)
+    with np.errstate(divide="ignore", over="ignore"):
+        proposal = mapped / predicted
+    use = seen & valid & (mapped > 0) & np.isfinite(predicted) & np.isfinite(proposal) & (proposal > 0)
     rays = in_camera[use] / mapped[use, None]
     return ObservedDistances(ids[use], mapped[use], predicted[use], pixels[use], rays)
+
+
+def unobserved(keyframe: Keyframe, submap: Submap, prediction: DepthPrediction) -> str:
+    """Why observations of a keyframe are of no use, counted: "" when all are."""
+    _, points, _ = submap.observed_points(keyframe)
+    in_camera = keyframe.in_camera(points)
+    pixels, seen = keyframe.camera.project(in_camera)
+    behind = ~seen & (in_camera[:, 2] <= 0)
+    counts = {
+        "of points that the map does not hold": int((~submap.rows_of(keyframe.point_ids)[1]).sum()),
+        "behind the camera": int(behind.sum()),
+        "outside the image": int((~seen & ~behind).sum()),
+        "where nothing is predicted": int((seen & ~sample_distance(prediction, pixels)[1]).sum()),
+    }
+    told = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+    return f"of {len(keyframe.point_ids)} observations {told}" if told else ""
 
 
 def sample_distance(prediction: DepthPrediction, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,12 +74,13 @@ def sample_distance(prediction: DepthPrediction, pixels: np.ndarray) -> tuple[np
     x, y = pixels[:, 0] - 0.5, pixels[:, 1] - 0.5
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
     total, weight = np.zeros(len(pixels)), np.zeros(len(pixels))
-    log_distance = np.log(np.where(prediction.valid, prediction.distance, 1.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_distance = np.log(np.where(prediction.valid, prediction.distance, 1.0))
     for dx in (0, 1):
         for dy in (0, 1):
             column, row = np.clip(x0 + dx, 0, width - 1), np.clip(y0 + dy, 0, height - 1)
             share = (1 - np.abs(x - (x0 + dx))) * (1 - np.abs(y - (y0 + dy))) * prediction.valid[row, column]
-            total += share * log_distance[row, column]
+            total += np.where(share > 0, share * log_distance[row, column], 0)
             weight += share
     valid = weight >= 0.5
     return np.exp(total / np.where(valid, weight, 1.0)), valid

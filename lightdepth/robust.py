@@ -6,8 +6,13 @@ Notation: a (n,) mapped distances, b (n,) predicted distances, both > 0; s the s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+
+Loss = Literal["geman_mcclure", "huber", "cauchy", "tukey"]
+HUBER, CAUCHY, TUKEY = 1.345, 2.3849, 4.685
+"""Of residuals in units of sigma: where each loss is 95 % efficient on Gaussian noise (Zhang 1997, table 1)."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +70,39 @@ def inlier_sigma(median: float, n: int, finite_sample: bool = False) -> float:
     return 1.4826 * median * (1 + 5 / (n - 1) if finite_sample else 1.0)
 
 
-def refine_scale(mapped: np.ndarray, predicted: np.ndarray, scale: float, sigma: float, iterations: int = 20) -> float:
-    """argmin over s of sum rho(r_k / sigma), Geman-McClure's rho(x) = x² / (1 + x²), from `scale` by reweighting."""
+def robust_weights(x: np.ndarray, loss: Loss = "geman_mcclure") -> np.ndarray:
+    """rho'(x) / x of residuals x in units of sigma, 1 at x = 0.
+
+    geman_mcclure: rho = x² / (1 + x²) / 2 · huber: x² / 2 up to 1.345, linear beyond · cauchy: c² log(1 + x² / c²) / 2
+    with c 2.3849 · tukey: c² (1 - (1 - x² / c²)³) / 6 up to c 4.685, constant beyond.
+    """
+    match loss:
+        case "geman_mcclure":
+            return 1 / (1 + x**2) ** 2
+        case "huber":
+            return HUBER / np.maximum(np.abs(x), HUBER)
+        case "cauchy":
+            return 1 / (1 + (x / CAUCHY) ** 2)
+        case "tukey":
+            return np.clip(1 - (x / TUKEY) ** 2, 0, None) ** 2
+    raise ValueError(f"loss {loss!r}; expected geman_mcclure, huber, cauchy or tukey")
+
+
+def refine_scale(
+    mapped: np.ndarray,
+    predicted: np.ndarray,
+    scale: float,
+    sigma: float,
+    iterations: int = 20,
+    loss: Loss = "geman_mcclure",
+) -> float:
+    """argmin over s of sum rho(r_k / sigma), from `scale` by reweighting: weights rho'(x) / x of `loss`."""
     mapped, predicted = np.asarray(mapped, np.float64), np.asarray(predicted, np.float64)
     sigma = max(sigma, 1e-12 * float(np.abs(mapped).max(initial=1.0)))
     for _ in range(iterations):
-        weights = 1 / (1 + ((mapped - scale * predicted) / sigma) ** 2) ** 2
+        weights = robust_weights((mapped - scale * predicted) / sigma, loss)
+        if not weights.any():
+            break  # Tukey sees no point within its reach: the start is all there is
         previous, scale = scale, float((weights * mapped * predicted).sum() / (weights * predicted**2).sum())
         if abs(scale - previous) <= 1e-12 * abs(scale):
             break

@@ -9,7 +9,9 @@ import pytest
 from scenes import ENDOMAPPER, cylinder
 from test_sparse_map import pose
 
-from densify.alignment import Alignment, AlignmentConfig, align
+from densify.alignment import Alignment, AlignmentConfig, align, bent
+from densify.bending import Bend, BendingConfig
+from lightdepth.errors import InputError
 from lightdepth.observations import ObservedDistances, observed_distances
 from lightdepth.sparse_map import Keyframe, Submap
 
@@ -21,8 +23,10 @@ def observed(n: int = 400, scale: float = 0.3, wrong: float = 0.0, noise: float 
     mapped = scale * predicted + noise * scale * 30 * rng.standard_normal(n)
     bad = np.arange(n) >= round(n * (1 - wrong))
     mapped[bad] = scale * predicted[bad] * (1.3 + rng.exponential(4, bad.sum()))
-    rays = np.tile([0.0, 0, 1], (n, 1))
-    return ObservedDistances(np.arange(n) + 100, np.abs(mapped), predicted, np.zeros((n, 2)), rays)
+    pixels = np.random.default_rng([seed, 1]).uniform(0, 100, (n, 2))
+    rays = np.stack([pixels[:, 0] / 50 - 1, pixels[:, 1] / 50 - 1, np.ones(n)], 1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return ObservedDistances(np.arange(n) + 100, np.abs(mapped), predicted, pixels, rays)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -118,3 +122,70 @@ def test_where_the_camera_is_in_the_map_does_not_matter(shift):
 
 def test_an_alignment_without_points_has_an_inlier_share_of_zero():
     assert Alignment("1", reason="no frame").inlier_share == 0
+
+
+def clustered(share: float, factor: float = 2.0, seed: int = 0) -> ObservedDistances:
+    """A share of the points agrees on a scale `factor` times the right one."""
+    pairs = observed(seed=seed)
+    wrong = np.arange(400) >= round(400 * (1 - share))
+    return replace(pairs, mapped=np.where(wrong, factor * pairs.mapped, pairs.mapped))
+
+
+@pytest.mark.parametrize("share", [0.45, 0.55])
+@pytest.mark.parametrize("factor", [0.6, 2.0])
+def test_a_second_scale_that_nearly_as_many_points_agree_on_is_said(share, factor):
+    """At 55 % LMedS takes the wrong scale, and its own figures look sound."""
+    found = align("1", clustered(share, factor), AlignmentConfig())
+    assert found.inlier_share > 0.5 and found.scale == pytest.approx(0.3 * (factor if share > 0.5 else 1), rel=0.05)
+    assert not found.ok and "two scales: " in found.reason
+    other = 1 / factor if share > 0.5 else factor
+    assert float(found.reason.split("agree on ")[1].split(" times")[0]) == pytest.approx(other, rel=0.1)
+
+
+def test_few_points_on_another_scale_and_scattered_wrong_points_are_no_second_mode():
+    assert align("1", clustered(0.25), AlignmentConfig()).ok
+    assert align("1", observed(wrong=0.4), AlignmentConfig()).ok
+    assert align("1", clustered(0.45), AlignmentConfig(max_second_mode=1.0)).ok
+
+
+def test_points_in_one_corner_of_the_view_are_worth_no_scale():
+    pairs = observed()
+    together = replace(pairs, rays=np.tile([0.0, 0, 1], (400, 1)) + 0.01 * pairs.rays)
+    found = align("1", together, AlignmentConfig())
+    assert not found.ok and "degrees of the view; at least 3" in found.reason
+    assert align("1", together, AlignmentConfig(min_spread_deg=0)).ok
+
+
+def test_points_at_one_distance_say_nothing_of_others():
+    pairs = observed(noise=0.0)
+    flat = replace(pairs, mapped=np.full(400, 3.0), predicted=np.full(400, 10.0))
+    found = align("1", flat, AlignmentConfig())
+    assert not found.ok and found.reason.startswith("the inliers' distances deviate by 0.0%")
+    assert align("1", flat, AlignmentConfig(min_distance_spread=0)).scale == pytest.approx(0.3)
+
+
+def test_few_inliers_are_a_reason():
+    found = align("1", observed(10, noise=0.0), AlignmentConfig(min_inliers=11))
+    assert found.reason == "10 inliers of 10 points; at least 11"
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "tukey"])
+def test_every_loss_finds_the_scale(loss):
+    assert align("1", observed(wrong=0.3), AlignmentConfig(loss=loss)).scale == pytest.approx(0.3, rel=0.01)
+
+
+def test_a_threshold_that_is_none_is_refused():
+    with pytest.raises(InputError, match=r"alignment\.t 0; expected a positive number"):
+        AlignmentConfig(t=0)
+
+
+def test_a_bend_is_judged_like_a_scale():
+    pairs = observed(wrong=0.3, noise=0.01)
+    config = BendingConfig(grids=(2,))
+    flat = Bend(config, 3.0, np.array([np.log(0.3), 0, 0, 0, 0, 0]), (100, 100))
+    before = align("1", pairs, AlignmentConfig())
+    same = bent(before, flat, pairs, AlignmentConfig())
+    assert same.ok and same.scale == pytest.approx(0.3) and same.bend is flat
+    assert np.isin(same.outlier_ids, pairs.point_ids[280:]).mean() > 0.8
+    tilted = replace(flat, weights=np.array([np.log(0.3), 1.5, 0, 0, 0, 0]))
+    assert not bent(before, tilted, pairs, AlignmentConfig()).ok

@@ -203,8 +203,82 @@ def test_a_model_that_predicts_nothing_leaves_every_keyframe_out():
         return replace(truth(frame), valid=np.zeros((80, 96), bool))
 
     result, _ = result_of(frames, model=blind)
-    assert set(reasons(result).values()) == {"0 observed points with a prediction; at least 8"}
-    assert len(result.dense.triangles) == 0
+    assert len(reasons(result)) == 10 and len(result.dense.triangles) == 0
+    for reason in reasons(result).values():
+        assert reason.startswith("0 observed points with a prediction; at least 8; of ")
+        assert reason.endswith(" where nothing is predicted")
+
+
+def test_points_behind_the_camera_are_told_and_the_other_keyframes_go_on():
+    frames = colon(0).frames
+    (submap,) = slam(frames).map.submaps
+    about = np.diag([-1.0, 1, -1, 1])  # looks backwards
+    turned = with_keyframe(submap, 3, cam_from_map=about @ submap.keyframes[3].cam_from_map)
+    result = densify_submap(turned, sequence(frames), truth, DensifyConfig(withhold=0.0))
+    assert list(reasons(result)) == ["000003.png"]
+    count = len(submap.keyframes[3].point_ids)
+    assert reasons(result)["000003.png"].endswith(f"of {count} observations {count} behind the camera")
+    assert len(result.dense.aligned) == 9 and len(result.dense.triangles) > 1000
+
+
+def test_observations_of_points_that_do_not_exist_are_told():
+    frames = colon(0).frames
+    (submap,) = slam(frames).map.submaps
+    ids = submap.keyframes[3].point_ids
+    result = densify_submap(
+        with_keyframe(submap, 3, point_ids=ids + 10**6), sequence(frames), truth, DensifyConfig(withhold=0.0)
+    )
+    expected = f"0 observed points with a prediction; at least 8; of {len(ids)} observations {len(ids)} of points that"
+    assert reasons(result)["000003.png"].startswith(expected)
+
+
+@pytest.mark.parametrize("wrong", [0.0, np.nan, np.inf])
+def test_predictions_that_are_no_distance_make_no_scale(wrong):
+    frames = colon(0).frames
+
+    def broken(frame: Frame):
+        right = truth(frame)
+        return right if frame.number != 3 else replace(right, distance=np.full_like(right.distance, wrong))
+
+    result, _ = result_of(frames, model=broken)
+    assert list(reasons(result)) == ["000003.png"] and len(result.dense.triangles) > 1000
+
+
+def test_a_submap_of_one_keyframe_and_a_constant_depth_give_a_surface():
+    frames = colon(0).frames
+    (submap,) = slam(frames).map.submaps
+    one = replace(submap, keyframes=submap.keyframes[:1])
+    assert len(densify_submap(one, sequence(frames), truth, DensifyConfig()).dense.triangles) > 500
+    constant = densify_submap(submap, sequence(frames), ConstantModel(), DensifyConfig())
+    assert np.isfinite(constant.dense.vertices).all()
+
+
+def test_a_submap_that_cannot_be_made_says_why_and_the_others_go_on():
+    frames = colon(0).frames
+    found = slam(frames, maps=2).map
+    nothing = {"pixels": np.zeros((0, 2)), "point_ids": np.zeros(0, int)}
+    blind = replace(found.submaps[0], keyframes=tuple(replace(k, **nothing) for k in found.submaps[0].keyframes))
+    first, second = densify(
+        sequence(frames), SparseMap((blind, found.submaps[1]), "map"), truth, DensifyConfig(recipe="paper")
+    )
+    assert len(first.dense.triangles) == 0 and len(second.dense.triangles) > 1000
+    assert all("no keyframe observes any of its points" in r for r in reasons(first).values())
+
+
+def test_the_paper_s_recipe_crops_and_neither_bends_nor_agrees():
+    frames = colon(0, camera=FISHEYE).frames
+    paper, full = (result_of(frames, DensifyConfig(recipe=r))[0] for r in ("paper", "full"))
+    assert all(a.bend is None for a in paper.dense.alignments) and "agree" not in paper.seconds
+    assert all(a.bend is not None for a in full.dense.aligned)
+    assert paper.seen_share < full.seen_share
+    with pytest.raises(InputError, match="recipe 'best'; expected full or paper"):
+        DensifyConfig(recipe="best")
+
+
+def test_what_is_not_kept_between_passes_is_made_again():
+    frames = colon(0).frames[:5]
+    kept, again = (result_of(frames, DensifyConfig(keep_mb=mb))[0] for mb in (1000, 0.3))
+    np.testing.assert_array_equal(np.sort(kept.dense.vertices, 0), np.sort(again.dense.vertices, 0))
 
 
 def test_every_submap_has_its_own_scale_and_every_keyframe_is_shown_once():
@@ -215,7 +289,8 @@ def test_every_submap_has_its_own_scale_and_every_keyframe_is_shown_once():
     for result in results:
         scale = found.map_from_world[result.dense.submap.id][0]
         assert np.median([a.scale for a in result.dense.aligned]) == pytest.approx(scale, rel=0.03)
-        assert {"read", "predict", "align", "integrate", "extract", "cover", "judge"} == set(result.seconds)
+        steps = {"read", "predict", "align", "agree", "integrate", "extract", "cover", "judge"}
+        assert steps == set(result.seconds)
     assert [(v.submap.id, v.keyframe.number) for v in shown] == [
         (s.id, k.number) for s in found.map.submaps for k in s.keyframes
     ]

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, minimize_scalar
 
-from lightdepth.robust import LMedS, inlier_sigma, lmeds_scale, median_rank, refine_scale
+from lightdepth.robust import (
+    CAUCHY,
+    HUBER,
+    TUKEY,
+    LMedS,
+    inlier_sigma,
+    lmeds_scale,
+    median_rank,
+    refine_scale,
+    robust_weights,
+)
 
 
 def distances(rng, n: int, outliers: float, noise: float, scale: float = 2.5) -> tuple[np.ndarray, np.ndarray]:
@@ -133,6 +143,41 @@ def test_refinement_reaches_the_minimum_of_its_objective(outliers, seed):
     assert found == pytest.approx(scalar.x, rel=1e-6)
     assert found == pytest.approx(robust.x[0], rel=1e-6)
     assert geman_mcclure(found, mapped, predicted, sigma) <= geman_mcclure(start.scale, mapped, predicted, sigma)
+
+
+def tukey(z: np.ndarray) -> np.ndarray:
+    """scipy's form: rho(z) and two derivatives, z the squared residual over the squared constant."""
+    inside = np.clip(1 - z, 0, None)
+    return np.stack([(1 - inside**3) / 3, inside**2, -2 * inside])
+
+
+@pytest.mark.parametrize(
+    ("loss", "scipys", "constant"), [("huber", "huber", HUBER), ("cauchy", "cauchy", CAUCHY), ("tukey", tukey, TUKEY)]
+)
+@pytest.mark.parametrize("outliers", [0.0, 0.3])
+def test_every_loss_is_refined_to_the_minimum_that_scipy_finds(loss, scipys, constant, outliers):
+    mapped, predicted = distances(np.random.default_rng(11), 300, outliers, 0.03)
+    start = lmeds_scale(mapped, predicted)
+    sigma = inlier_sigma(start.median, 300)
+    found = refine_scale(mapped, predicted, start.scale, sigma, iterations=300, loss=loss)
+    oracle = least_squares(
+        lambda s: (mapped - s * predicted) / sigma, start.scale, loss=scipys, f_scale=constant, xtol=1e-14, ftol=1e-14
+    )
+    assert found == pytest.approx(oracle.x[0], rel=1e-6)
+    assert refine_scale(mapped, predicted, start.scale, sigma, loss="geman_mcclure") != found
+
+
+def test_weights_are_one_at_zero_and_fall_and_another_loss_is_refused():
+    x = np.array([0.0, 1.0, 3.0, 10.0])
+    for loss in ("geman_mcclure", "huber", "cauchy", "tukey"):
+        w = robust_weights(x, loss)
+        assert w[0] == 1 and (np.diff(w) <= 0).all() and w[-1] < 0.2
+    with pytest.raises(ValueError, match="loss 'l1'; expected geman_mcclure"):
+        robust_weights(x, "l1")
+
+
+def test_tukey_that_reaches_no_point_leaves_the_scale():
+    assert refine_scale(np.full(9, 50.0), np.ones(9), 2.0, 0.1, loss="tukey") == 2.0
 
 
 def test_twenty_iterations_of_refinement_are_enough():

@@ -1,0 +1,243 @@
+"""The keyframes of a submap brought to agree: on the map's points, and where they see the same tissue.
+
+Notation: keyframe i with camera centre c_i; b predicted, a mapped distance, d_i = b exp(phi' w_i) the bent distance
+(densify.bending); X a pixel of keyframe i placed in the map by d_i, p its projection in keyframe j. The unknowns w of
+all keyframes minimise together
+
+    sum_i sum_k rho((log a_ik - log d_i(k)) / s)                    map points k that keyframe i observed
+    + overlap sum_ij sum_X rho((log |X - c_j| - log d_j(p)) / o)    pixels of i that j sees as well
+    + sum_i w_i' diag(prior) w_i                                    the ridge of the bending
+
+with Geman-McClure's rho, s and o robust deviations of the residuals at hand (1.4826 median). Residuals are of the
+logarithm, because both a network and a triangulation err in proportion to the distance or faster. Solved by
+Gauss-Newton on sparse normal equations, with weights and projections renewed in every round; nothing in it is random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from densify.bending import Bend, BendingConfig
+from lightdepth.observations import ObservedDistances
+from lightdepth.prediction import DepthPrediction
+from lightdepth.robust import robust_weights
+from lightdepth.sparse_map import Keyframe
+
+_STEP = 1e-3  # of log distance, to differentiate by
+_LEAST_SIGMA = 0.01  # of log distance: exact data must not make a single residual decide
+
+
+@dataclass(frozen=True)
+class AgreementConfig:
+    """What the keyframes of a submap must agree on."""
+
+    on: bool = True  # off, every keyframe keeps its LMedS scale, and nothing bends
+    overlap: float = 0.1  # weight of an overlap residual against a point's; 0: keyframes do not look at each other
+    neighbours: int = 4  # keyframes that each is compared with: those that share most points with it
+    samples: int = 16  # pixels across the image that are compared, as many as that keeps square
+    rounds: int = 8
+    tolerance: float = 1e-3  # of log distance: a round that moves nothing by more is the last
+    max_gap: float = 0.5  # overlap residuals beyond are of other tissue: occlusion
+
+
+@dataclass(frozen=True)
+class View:
+    """A keyframe as the agreement sees it: what it observed, its log predicted distance at few rows (h, w) float32
+    with validity (h, w), and its LMedS scale."""
+
+    keyframe: Keyframe
+    observed: ObservedDistances
+    log_distance: np.ndarray
+    valid: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(
+        cls, keyframe: Keyframe, observed: ObservedDistances, prediction: DepthPrediction, scale: float, rows: int = 128
+    ) -> View:
+        height, width = prediction.distance.shape
+        rows = min(rows, height)
+        size = (max(1, round(width * rows / height)), rows)
+        log = np.log(np.where(prediction.valid, prediction.distance, 1)).astype(np.float32)
+        share = cv2.resize(prediction.valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        log = cv2.resize(log * prediction.valid, size, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
+        return cls(keyframe, observed, log, share > 0.99, scale)
+
+    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Log predicted distance (n,) at x (n, 2) in [0, 1]², and where it is known (n,)."""
+        height, width = self.valid.shape
+        place = (x * (width, height) - 0.5).astype(np.float32)
+        inside = ((place >= 0) & (place <= (width - 1, height - 1))).all(1)
+        maps = place[None, :, 0], place[None, :, 1]
+        log = cv2.remap(self.log_distance, *maps, cv2.INTER_LINEAR)[0]
+        known = cv2.remap(self.valid.astype(np.float32), *maps, cv2.INTER_LINEAR)[0]
+        return log.astype(np.float64), inside & (known > 0.999)
+
+    def grid(self, samples: int) -> np.ndarray:
+        """x (n, 2) of known pixels, `samples` across the image."""
+        height, width = self.valid.shape
+        down = max(2, round(samples * height / width))
+        y, x = np.meshgrid((np.arange(down) + 0.5) / down, (np.arange(samples) + 0.5) / samples, indexing="ij")
+        places = np.stack([x.ravel(), y.ravel()], 1)
+        return places[self.at(places)[1]]
+
+
+def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, bending: BendingConfig) -> list[Bend]:
+    """The field of every view. `shared` (n, n) counts the points that two views share (sparse_map.covisibility)."""
+    bends = [_unbent(view, bending) for view in views]
+    if not config.on:
+        return bends
+    unknowns = len(bending.precision)
+    prior = sparse.diags(np.tile(bending.precision, len(views)))
+    pairs = _pairs(shared, config.neighbours) if config.overlap else []
+    places = [_Places.of(view, bend, config.samples) for view, bend in zip(views, bends, strict=True)]
+    w = np.concatenate([bend.weights for bend in bends])
+    for round_ in range(config.rounds):
+        widen = 2.0 ** max(0, 2 - round_)
+        rows = [
+            _point_rows(i, view, bend, places[i], widen)
+            for i, (view, bend) in enumerate(zip(views, bends, strict=True))
+        ]
+        rows += _overlap_rows(views, bends, places, pairs, config)
+        normal, right = _normal_equations(rows, len(views), unknowns)
+        step = spsolve((normal + prior).tocsc(), right - prior @ w)
+        if not np.isfinite(step).all():
+            break  # nothing holds some unknown: stay where the last round was
+        w = w + step
+        bends = [replace(b, weights=w[i * unknowns : (i + 1) * unknowns]) for i, b in enumerate(bends)]
+        if np.abs(step).max() < config.tolerance:
+            break
+    return bends
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Residuals (n,), their weights (n,) and minus their derivatives (n, m) by the unknowns of each view named."""
+
+    residual: np.ndarray
+    weight: np.ndarray
+    blocks: dict[int, np.ndarray]
+
+
+def _normal_equations(rows: Sequence[_Rows], views: int, unknowns: int) -> tuple[sparse.spmatrix, np.ndarray]:
+    """J' W J, sparse, and J' W r. Built block by block: views that do not meet have none."""
+    blocks: dict[tuple[int, int], np.ndarray] = {}
+    right = np.zeros((views, unknowns))
+    for r in rows:
+        for i, of_i in r.blocks.items():
+            weighted = (of_i * r.weight[:, None]).T
+            right[i] += weighted @ r.residual
+            for j, of_j in r.blocks.items():
+                blocks[i, j] = blocks.get((i, j), 0) + weighted @ of_j
+    order = sorted(blocks)
+    first = np.searchsorted([i for i, _ in order], np.arange(views + 1))
+    data = np.stack([blocks[place] for place in order])
+    size = views * unknowns
+    return sparse.bsr_matrix((data, [j for _, j in order], first), (size, size)), right.ravel()
+
+
+def _unbent(view: View, bending: BendingConfig) -> Bend:
+    weights = np.zeros(len(bending.precision))
+    weights[0] = np.log(view.scale)
+    known = view.log_distance[view.valid]
+    middle = float(np.median(known)) if len(known) else 0.0
+    return Bend(bending, middle, weights, (view.keyframe.camera.width, view.keyframe.camera.height))
+
+
+@dataclass(frozen=True)
+class _Places:
+    """What no round changes: the basis at the points (n, m), and of a grid of pixels the unit rays (g, 3), log
+    predicted distance (g,) and basis (g, m)."""
+
+    at_points: np.ndarray
+    rays: np.ndarray
+    log_predicted: np.ndarray
+    basis: np.ndarray
+
+    @classmethod
+    def of(cls, view: View, bend: Bend, samples: int) -> _Places:
+        o, x = view.observed, view.grid(samples)
+        log_predicted, _ = view.at(x)
+        rays, _ = view.keyframe.camera.unproject(x * bend.image_size)
+        at_points = bend.basis(o.pixels / bend.image_size, np.log(o.predicted))
+        return cls(at_points, rays, log_predicted, bend.basis(x, log_predicted))
+
+
+def _point_rows(index: int, view: View, bend: Bend, places: _Places, widen: float) -> _Rows:
+    o, phi = view.observed, places.at_points
+    residual = np.log(o.mapped) - np.log(o.predicted) - phi @ bend.weights
+    sigma = max(1.4826 * float(np.median(np.abs(residual))), _LEAST_SIGMA)
+    return _Rows(residual, _weight(residual / (widen * sigma)) / sigma**2, {index: phi})
+
+
+def _weight(x: np.ndarray) -> np.ndarray:
+    return robust_weights(x / 2)  # half weight at 1.3 sigma, so that fewer good residuals are lost
+
+
+def _pairs(shared: np.ndarray, neighbours: int) -> list[tuple[int, int]]:
+    """Each view with those that share most points with it, in both directions."""
+    pairs = set()
+    for i, row in enumerate(shared):
+        order = np.argsort(-row, kind="stable")
+        for j in [int(j) for j in order if j != i and row[j]][:neighbours]:
+            pairs |= {(i, j), (j, i)}
+    return sorted(pairs)
+
+
+def _overlap_rows(
+    views: Sequence[View],
+    bends: Sequence[Bend],
+    places: Sequence[_Places],
+    pairs: Sequence[tuple[int, int]],
+    config: AgreementConfig,
+) -> list[_Rows]:
+    found = []
+    for i, view in enumerate(views):
+        partners = [j for a, j in pairs if a == i]
+        rays, phi = places[i].rays, places[i].basis
+        if not partners or not len(rays):
+            continue
+        log_d = places[i].log_predicted + phi @ bends[i].weights
+        for j in partners:
+            here = gap_between(view, views[j], bends[j], rays, log_d)
+            moved = gap_between(view, views[j], bends[j], rays, log_d + _STEP)
+            slope = (moved.gap - here.gap) / _STEP
+            use = here.known & moved.known & (np.abs(here.gap) < config.max_gap) & (np.abs(slope) < 5)
+            if use.sum() >= 10:
+                blocks = {i: -slope[use, None] * phi[use], j: bends[j].basis(here.x[use], here.log_predicted[use])}
+                found.append(_Rows(here.gap[use], np.ones(int(use.sum())), blocks))
+    if not found:
+        return []
+    sigma = max(1.4826 * float(np.median(np.abs(np.concatenate([f.residual for f in found])))), _LEAST_SIGMA)
+    return [_Rows(f.residual, config.overlap * _weight(f.residual / sigma) / sigma**2, f.blocks) for f in found]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Pixels X of one view as another sees them: `gap` (n,) = log |X - c| - log d(p), where `known` (n,); p at `x`
+    (n, 2) in [0, 1]², log predicted distance there (n,), and `log_reach` (n,) = log |X - c|."""
+
+    gap: np.ndarray
+    known: np.ndarray
+    x: np.ndarray
+    log_predicted: np.ndarray
+    log_reach: np.ndarray
+
+
+def gap_between(view: View, other: View, bend: Bend, rays: np.ndarray, log_d: np.ndarray) -> Gap:
+    """Pixels of `view`, on unit rays (n, 3) at log distance log_d (n,), against the depth of `other`, bent."""
+    other_from_view = other.keyframe.cam_from_map @ np.linalg.inv(view.keyframe.cam_from_map)
+    points = (rays * np.exp(log_d)[:, None]) @ other_from_view[:3, :3].T + other_from_view[:3, 3]
+    camera = other.keyframe.camera
+    pixels, seen = camera.project(points)
+    x = np.where(seen[:, None], pixels / (camera.width, camera.height), 0.5)
+    log_predicted, known = other.at(x)
+    log_reach = np.log(np.linalg.norm(points, axis=1).clip(min=1e-12))
+    d = log_predicted + bend.basis(x, log_predicted) @ bend.weights
+    return Gap(log_reach - d, seen & known, x, log_predicted, log_reach)

@@ -1,0 +1,113 @@
+"""A depth map bent by a smooth field: the network's errors are smooth, and a map knows more than one number about them.
+
+Notation: b predicted distance, x pixel over the image's size, in [0, 1]²; d = b exp(f) the bent distance, with
+
+    f(x, b) = phi(x, b)' w,   phi = (1, log b - log b0, g_1(x), ..., g_m(x)),
+
+b0 the median predicted distance of the keyframe and g Gaussian bumps on regular grids over the image, as wide as the
+step of their grid, less their mean over the image. So w[0] is the log of the keyframe's scale: the mean of f over the
+image, but for the slope. The others are pulled to 0 by a ridge, each with the
+deviation that its part of the field is expected to have. A field is as smooth as its finest grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from lightdepth.errors import InputError
+from lightdepth.prediction import DepthPrediction
+
+
+@dataclass(frozen=True)
+class BendingConfig:
+    """How a keyframe's depth may bend. Off, it is scaled only."""
+
+    on: bool = True
+    grids: tuple[int, ...] = (5,)  # bumps across and down, one number per level
+    slope_deviation: float = 0.3  # expected change of log d per change of log b
+    bump_deviation: float = 0.1  # expected size of a bump, in log d
+
+    def __post_init__(self) -> None:
+        if any(n < 2 for n in self.grids):
+            raise InputError(f"bending.grids {list(self.grids)}; expected at least 2 bumps across and down")
+        if self.slope_deviation < 0 or not self.bump_deviation > 0:
+            raise InputError(
+                f"bending: slope_deviation {self.slope_deviation}, bump_deviation {self.bump_deviation}; expected "
+                "at least 0 (no slope) and above 0"
+            )
+
+    @property
+    def precision(self) -> np.ndarray:
+        """Of the prior of w (m,): 0 for the scale, which is free."""
+        if not self.on:
+            return np.zeros(1)
+        slope = [self.slope_deviation**-2] if self.slope_deviation else []
+        bumps = [np.full(n * n, self.bump_deviation**-2) for n in self.grids]
+        return np.concatenate([[0.0], slope, *bumps])
+
+
+@dataclass(frozen=True)
+class Bend:
+    """The field of one keyframe: `weights` w (m,), `log_middle` log b0, image_size (width, height)."""
+
+    config: BendingConfig
+    log_middle: float
+    weights: np.ndarray
+    image_size: tuple[int, int]
+
+    @property
+    def scale(self) -> float:
+        """Map units per predicted unit where the field is zero."""
+        return float(np.exp(self.weights[0]))
+
+    def basis(self, x: np.ndarray, log_distance: np.ndarray) -> np.ndarray:
+        """phi (n, m) at x (n, 2) in [0, 1]² and log predicted distance (n,)."""
+        parts = [np.ones((len(x), 1))]
+        if not self.config.on:
+            return parts[0]
+        if self.config.slope_deviation:
+            parts.append((log_distance - self.log_middle)[:, None])
+        for n in self.config.grids:
+            across, down, mean = _bumps(x[:, 0], n), _bumps(x[:, 1], n), _mean(n)
+            parts.append((down[:, :, None] * across[:, None, :] - np.outer(mean, mean)).reshape(len(x), -1))
+        return np.concatenate(parts, 1)
+
+    def at(self, pixels: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+        """f (n,) at pixels (n, 2) with predicted distance (n,)."""
+        return self.basis(pixels / self.image_size, np.log(predicted)) @ self.weights
+
+    def field(self, log_distance: np.ndarray) -> np.ndarray:
+        """f (H, W) over an image of log predicted distances (H, W)."""
+        height, width = log_distance.shape
+        field, used = np.full(log_distance.shape, self.weights[0], np.float32), 1
+        if not self.config.on:
+            return field
+        if self.config.slope_deviation:
+            field += np.float32(self.weights[1]) * (log_distance - np.float32(self.log_middle))
+            used = 2
+        for n in self.config.grids:
+            down = _bumps((np.arange(height) + 0.5) / height, n)
+            across = _bumps((np.arange(width) + 0.5) / width, n)
+            weights = self.weights[used : used + n * n].reshape(n, n)
+            field += (down @ weights @ across.T - _mean(n) @ weights @ _mean(n)).astype(np.float32)
+            used += n * n
+        return field
+
+    def applied(self, prediction: DepthPrediction) -> DepthPrediction:
+        """The bent prediction, in map units."""
+        log_distance = np.log(np.where(prediction.valid, prediction.distance, 1)).astype(np.float32)
+        return replace(prediction, distance=np.exp(log_distance + self.field(log_distance)), unit="map units")
+
+
+def _bumps(x: np.ndarray, n: int) -> np.ndarray:
+    """Gaussians (len(x), n) centred at n places from 0 to 1, as wide as their step."""
+    return np.exp(-0.5 * ((x[:, None] - np.linspace(0, 1, n)) * (n - 1)) ** 2)
+
+
+@lru_cache(maxsize=8)
+def _mean(n: int) -> np.ndarray:
+    """Of each bump (n,) over [0, 1]."""
+    return _bumps((np.arange(256) + 0.5) / 256, n).mean(0)

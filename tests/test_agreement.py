@@ -1,0 +1,117 @@
+"""Keyframes that agree: smooth errors found from points and overlap, and what contradicts a nearer view known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from colons import EXACT, colon, slam, truth
+
+from densify.agreement import AgreementConfig, View, agree
+from densify.bending import BendingConfig
+from densify.contradiction import ContradictionConfig, uncontradicted, without
+from lightdepth.observations import observed_distances
+from lightdepth.prediction import DepthPrediction
+from lightdepth.sparse_map import covisibility
+
+ALONE = AgreementConfig(overlap=0)
+RIGID = BendingConfig(on=False)
+
+
+@cache
+def scene(spurious: float = 0.0):
+    frames = colon(0).frames[:6]
+    found = slam(frames, config=replace(EXACT, spurious=spurious), spurious=spurious)
+    (submap,) = found.map.submaps
+    return frames, submap, found.map_from_world[0][0], covisibility(submap)
+
+
+def tilted(frame, factor: float = 1.0, tilt: float = 0.3) -> DepthPrediction:
+    """Truth times a factor, with an error that grows smoothly from left to right."""
+    right = truth(frame)
+    across = np.linspace(-0.5, 0.5, frame.camera.width, dtype=np.float32)
+    return replace(right, distance=right.distance * np.float32(factor) * np.exp(tilt * across)[None])
+
+
+def views_of(predictions, start: float = 1.0, spurious: float = 0.0, points: int | None = None) -> list[View]:
+    _, submap, scale, _ = scene(spurious)
+    made = []
+    for i, (keyframe, p) in enumerate(zip(submap.keyframes, predictions, strict=True)):
+        observed = observed_distances(keyframe, submap, p)
+        if points is not None and i == 2:
+            observed = observed.subset(np.arange(len(observed)) < points)
+        made.append(View.of(keyframe, observed, p, start * scale))
+    return made
+
+
+def errors(bends, predictions, spurious: float = 0.0) -> list[float]:
+    """Median relative error of each bent depth map."""
+    frames, _, scale, _ = scene(spurious)
+    return [
+        float(np.median(np.abs(bend.applied(p).distance[p.valid] / (scale * f.true_distance[p.valid]) - 1)))
+        for bend, p, f in zip(bends, predictions, frames, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("overlap", [0.0, 0.1])
+@pytest.mark.parametrize("spurious", [0.0, 0.3])
+def test_a_smooth_error_is_bent_away_and_one_scale_cannot(overlap, spurious):
+    predictions = [tilted(f) for f in scene()[0]]
+    views, shared = views_of(predictions, spurious=spurious), scene(spurious)[3]
+    config = AgreementConfig(overlap=overlap)
+    rigid, bent = (errors(agree(views, shared, config, b), predictions, spurious) for b in (RIGID, BendingConfig()))
+    assert min(rigid) > 0.05 and max(bent) < 0.012
+
+
+def test_true_depth_stays_as_it_is():
+    predictions = [truth(f) for f in scene()[0]]
+    bends = agree(views_of(predictions), scene()[3], AgreementConfig(), BendingConfig())
+    assert max(errors(bends, predictions)) < 0.004
+    assert [b.scale for b in bends] == pytest.approx([scene()[2]] * 6, rel=0.01)
+
+
+def test_overlap_holds_a_keyframe_whose_few_points_cannot():
+    """Keyframe 2 has eight points, all 10 % too far."""
+    predictions = [truth(f) for f in scene()[0]]
+    views = views_of(predictions, points=8)
+    views[2] = replace(views[2], observed=replace(views[2].observed, mapped=1.1 * views[2].observed.mapped))
+    alone, together = (errors(agree(views, scene()[3], c, RIGID), predictions)[2] for c in (ALONE, AgreementConfig()))
+    assert alone > 0.09 and together < 0.02
+
+
+def test_equal_views_give_equal_fields_and_off_keeps_the_scales():
+    predictions = [tilted(f) for f in scene()[0]]
+    views, shared = views_of(predictions, start=1.03), scene()[3]
+    one, other = (agree(views, shared, AgreementConfig(), BendingConfig()) for _ in range(2))
+    assert all(np.array_equal(a.weights, b.weights) for a, b in zip(one, other, strict=True))
+    off = agree(views, shared, AgreementConfig(on=False), BendingConfig())
+    assert all(b.scale == pytest.approx(1.03 * scene()[2]) and not b.weights[1:].any() for b in off)
+
+
+def test_a_single_keyframe_and_a_constant_depth_are_no_trouble():
+    first = replace(truth(scene()[0][0]), distance=np.ones_like(truth(scene()[0][0]).distance))
+    frames, submap, scale, _ = scene()
+    observed = observed_distances(submap.keyframes[0], submap, first)
+    view = View.of(submap.keyframes[0], observed, first, 30 * scale)
+    (bend,) = agree([view], np.array([[len(observed)]]), AgreementConfig(), BendingConfig())
+    distance = bend.applied(first).distance / scale
+    middle = np.median(frames[0].true_distance[first.valid])
+    assert np.isfinite(distance).all() and np.median(distance[first.valid]) == pytest.approx(middle, rel=0.2)
+
+
+def test_what_floats_before_a_nearer_view_s_surface_is_contradicted_and_truth_is_not():
+    frames, _, _, shared = scene()
+    right = [truth(f) for f in frames]
+    patch = np.zeros(right[0].valid.shape, bool)
+    patch[34:46, 42:54] = True  # the far middle of the first image, seen better by those ahead
+    wrong = replace(right[0], distance=np.where(patch, 0.6 * right[0].distance, right[0].distance))
+    config, still = ContradictionConfig(), AgreementConfig(on=False)
+    for first, low, high in ((right[0], 0.9, 1.0), (wrong, 0.0, 0.2)):
+        views = views_of([first, *right[1:]])
+        bends = agree(views, shared, still, BendingConfig())
+        stays = uncontradicted(views, bends, shared, config)
+        kept = [without(p.valid, s) for p, s in zip([first, *right[1:]], stays, strict=True)]
+        assert low <= kept[0][patch].mean() <= high
+        assert np.mean([k.sum() / p.valid.sum() for k, p in zip(kept, right, strict=True)]) > 0.9

@@ -1,0 +1,73 @@
+"""A smooth field over a depth map: what it is made of, and that an image and single pixels are bent alike."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from colons import CAMERA
+
+from densify.bending import Bend, BendingConfig
+from lightdepth.errors import InputError
+from lightdepth.prediction import DepthPrediction
+
+SIZE = (CAMERA.width, CAMERA.height)
+
+
+def some_bend(config: BendingConfig, seed: int = 0) -> Bend:
+    weights = np.random.default_rng(seed).normal(0, 0.2, len(config.precision))
+    return Bend(config, np.log(30.0), weights, SIZE)
+
+
+def prediction(seed: int = 0) -> DepthPrediction:
+    distance = np.random.default_rng(seed).uniform(10, 60, SIZE[::-1]).astype(np.float32)
+    return DepthPrediction("1", distance, np.ones(SIZE[::-1], bool), CAMERA, "test")
+
+
+@pytest.mark.parametrize("grids", [(), (5,), (2, 4)])
+@pytest.mark.parametrize("slope", [0.0, 0.3])
+def test_an_image_is_bent_as_its_pixels_are(grids, slope):
+    bend, flat = some_bend(BendingConfig(grids=grids, slope_deviation=slope)), prediction()
+    columns, rows = np.array([0, 3, 95]), np.array([0, 41, 79])
+    predicted = flat.distance[rows, columns].astype(float)
+    factor = np.exp(bend.at(np.stack([columns, rows], -1) + 0.5, predicted))
+    assert bend.applied(flat).distance[rows, columns] == pytest.approx(predicted * factor, rel=1e-5)
+    assert bend.applied(flat).unit == "map units"
+
+
+def test_without_slope_the_first_weight_is_the_mean_of_the_field():
+    bend = some_bend(BendingConfig(slope_deviation=0.0))
+    log = np.log(prediction().distance)
+    assert bend.field(log).mean() == pytest.approx(bend.weights[0], abs=1e-3)
+    assert np.ptp(bend.field(log)) > 0.1 and bend.scale == np.exp(bend.weights[0])
+
+
+def test_a_slope_stretches_distances_about_the_middle():
+    bend = Bend(BendingConfig(grids=()), np.log(30.0), np.array([0.0, 0.1]), SIZE)
+    assert np.exp(bend.at(np.zeros((2, 2)), np.array([30.0, 60.0]))) == pytest.approx([1, 2**0.1])
+
+
+def test_off_it_is_one_scale():
+    config = BendingConfig(on=False)
+    bend = Bend(config, 0.0, np.array([np.log(0.5)]), SIZE)
+    assert config.precision.tolist() == [0]
+    np.testing.assert_allclose(bend.applied(prediction()).distance, 0.5 * prediction().distance, rtol=1e-6)
+    assert bend.at(np.zeros((3, 2)), np.ones(3)) == pytest.approx(np.log([0.5] * 3))
+
+
+def test_invalid_pixels_do_not_matter():
+    flat = prediction()
+    broken = replace(flat, distance=flat.distance.copy(), valid=flat.valid.copy())
+    broken.distance[:10], broken.valid[:10] = np.nan, False
+    one, other = (some_bend(BendingConfig()).applied(p).distance for p in (flat, broken))
+    np.testing.assert_array_equal(one[10:], other[10:])
+    assert np.isfinite(other).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"), [({"grids": (1,)}, "at least 2 bumps"), ({"bump_deviation": 0.0}, "bump_deviation 0.0")]
+)
+def test_bendings_that_are_none_are_refused(changes, what):
+    with pytest.raises(InputError, match=what):
+        BendingConfig(**changes)
