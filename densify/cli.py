@@ -416,7 +416,9 @@ class Densified:
         baselines: Sequence[SubmapResult] = []
         if config.withhold:
             with Progress("Constant distance, for comparison", count) as bar:
-                baselines = densify_maps(frames, sparse_map, load_model("constant"), config, lambda _: bar.advance())
+                # At one scale per keyframe: bent to the points of the map, a constant would be the map's merit.
+                rigid = replace(config, agreement=replace(config.agreement, on=False))
+                baselines = densify_maps(frames, sparse_map, load_model("constant"), rigid, lambda _: bar.advance())
         return cls(model.name, results, baselines, gallery)
 
     def write(self, run: Run, formats: tuple[str, ...], mm_per_unit: float | None) -> None:

@@ -10,6 +10,7 @@ import pytest
 from colons import CAMERA, EXACT, colon, sequence, slam, truth
 from scipy.spatial import cKDTree
 
+from densify.agreement import AgreementConfig
 from densify.alignment import Alignment
 from densify.dense_map import DenseMap
 from densify.evaluation import closest, fit_similarity, true_cloud
@@ -62,7 +63,8 @@ def test_exact_depth_on_an_exact_map_gives_the_wall_to_a_tenth_of_a_voxel(camera
 
 def test_withheld_points_are_close_to_a_true_surface_and_far_from_a_constant_one():
     frames = colon(1).frames
-    right, constant = (result_of(frames, model=m, spurious=0.0)[0].withheld for m in (truth, ConstantModel()))
+    rigid = DensifyConfig(agreement=AgreementConfig(on=False))  # bent to this many points, any depth comes close
+    right, constant = (result_of(frames, rigid, model=m, spurious=0.0)[0].withheld for m in (truth, ConstantModel()))
     assert right.median < 0.02 and right.miss < 0.05
     assert constant.median > 5 * right.median
     assert right.points > 500 and right.median_met <= right.median <= right.p90
