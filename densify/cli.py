@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -37,7 +37,9 @@ from densify.judge import (
     withheld_errors,
 )
 from densify.measure import chosen_map, measured, places_in_frame, run_unit, summary
-from densify.page import Gallery, densify_page
+from densify.merge import MergeConfig, Merged, joined_name
+from densify.merge import merge as merge_maps
+from densify.page import Gallery, densify_page, joined_section
 from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, fitted_to_frames
 from densify.pipeline import densify as densify_maps
 from densify.rectify import RectifyConfig
@@ -45,9 +47,11 @@ from densify.sfm import SfmConfig, sparse_map_from_frames
 from densify.suite import present, read_suite
 from densify.tables import write_evaluations
 from densify.trajectory import read_trajectories, trajectory_files
+from densify.unmapped import summary as unmapped_summary
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.commands import write_synthetic
 from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.datasets.folder import read_tum
 from lightdepth.errors import InputError
 from lightdepth.light_fit import fit_on_map, with_light
 from lightdepth.maps import read_map
@@ -86,9 +90,11 @@ def densify(
     formats: tuple[str, ...] = ("ply",),
     mm_per_unit: float | None = None,
     fit_light: bool = True,
+    merge: bool = True,
+    merging: MergeConfig = MergeConfig(),
     overwrite: bool = False,
 ) -> None:
-    """Dense surfaces from frames and a sparse map, one per submap.
+    """Dense surfaces from frames and a sparse map, one per submap, and one more for submaps that meet.
 
     Args:
         data: folder of frames
@@ -113,6 +119,8 @@ def densify(
         formats: of the mesh: ply, glb, obj
         mm_per_unit: millimetres per map unit, where known; lengths are then written in mm
         fit_light: where nobody gave the light, fit it on the map and use it if withheld keyframes agree
+        merge: join submaps that see the same tissue, and give each group one surface besides the single ones
+        merging: when two submaps are one
         overwrite: replace a run made before
     """
     arguments = {k: v for k, v in locals().items() if k != "overwrite"}
@@ -131,7 +139,7 @@ def densify(
             run.hash_input(name, path)
         if fit_light and light is None and checkpoint != "constant":
             frames = _fitted_light(run, frames, sparse_map, model)
-        work = Densified.make(frames, sparse_map, model, config)
+        work = Densified.make(frames, sparse_map, model, config, merging if merge else None)
         work.write(run, formats, mm_per_unit)
         notes = [f"{data}, {sparse_map.source}; depth by {work.model}; light of the frames: {_light(frames)}."]
         notes += [f"Light {run.record['light_fit']['summary']}."] if "light_fit" in run.record else []
@@ -142,6 +150,8 @@ def densify(
                 "projection, so scales and inliers rest on weaker ground."
             )
         page = densify_page("Densified maps", work.results, work.baselines, work.gallery, notes, None, mm_per_unit)
+        if work.merged is not None:
+            joined_section(page, work.merged)
         page.write(run.folder / "report.html")
         run.log(f"{output}/report.html")
 
@@ -152,6 +162,7 @@ def sparse(
     format: str | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
+    poses: str | None = None,
     sfm: SfmConfig = SfmConfig(),
     overwrite: bool = False,
 ) -> None:
@@ -163,13 +174,16 @@ def sparse(
         format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
         camera: calibration file that wins over the folder's
         mask: image, white where tissue shows
+        poses: where poses are known and points are only triangulated: truth, those of the sequence, or a TUM file
+            (world from camera) whose times are frame numbers
         sfm: how frames are mapped
         overwrite: replace a folder made before
     """
     arguments = {k: v for k, v in locals().items() if k != "overwrite"}
     with run_folder(output, "sparse", arguments, overwrite) as run:
         run.hash_input("data", data)
-        _sparse(run, open_sequence(data, format, camera, None, mask), sfm)
+        frames = open_sequence(data, format, camera, None, mask)
+        _sparse(run, frames, sfm, None if poses is None else _poses(poses, frames))
 
 
 def evaluate(
@@ -400,10 +414,18 @@ class Densified:
     results: Sequence[SubmapResult]
     baselines: Sequence[SubmapResult]
     gallery: Gallery
+    merged: Merged | None = None
     extra: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def make(cls, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel, config: DensifyConfig) -> Densified:
+    def make(
+        cls,
+        frames: FrameSequence,
+        sparse_map: SparseMap,
+        model: DepthModel,
+        config: DensifyConfig,
+        merging: MergeConfig | None = None,
+    ) -> Densified:
         gallery = Gallery(sparse_map)
         count = sum(len(s.keyframes) for s in sparse_map.submaps)
         with Progress("Densifying", count) as bar:
@@ -419,7 +441,11 @@ class Densified:
                 # At one scale per keyframe: bent to the points of the map, a constant would be the map's merit.
                 rigid = replace(config, agreement=replace(config.agreement, on=False))
                 baselines = densify_maps(frames, sparse_map, load_model("constant"), rigid, lambda _: bar.advance())
-        return cls(model.name, results, baselines, gallery)
+        merged = None
+        if merging is not None and len(results) > 1:
+            with Progress("Joining submaps", count) as bar:
+                merged = merge_maps(results, frames, model, config, merging, lambda _: bar.advance())
+        return cls(model.name, results, baselines, gallery, merged)
 
     def write(self, run: Run, formats: tuple[str, ...], mm_per_unit: float | None) -> None:
         """Every surface's folder, its figures in run.json and a line for the user. Raises InputError when none was
@@ -463,9 +489,25 @@ class Densified:
             if result.coverage is not None:
                 text += f"; {result.coverage.well_share:.0%} of the wall seen well, {len(result.coverage.holes)} holes"
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
+        if self.merged is not None:
+            self._write_joined(run, self.merged, formats, mm_per_unit)
         run.record.update(
             {"unit": "mm" if mm_per_unit else "map units", "checkpoint": self.model, "maps": plain(records)}
         )
+
+    def _write_joined(self, run: Run, merged: Merged, formats: tuple[str, ...], mm_per_unit: float | None) -> None:
+        run.record["merge"] = plain(merged.record(mm_per_unit or 1.0))
+        for result, group in zip(merged.results, merged.groups, strict=True):
+            dense, name = result.dense, joined_name(result)
+            if not len(dense.triangles):
+                run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
+                continue
+            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, mm_per_unit)
+            maps = ", ".join(map(str, sorted(group)))
+            text = f"{name}: maps {maps} in one, in the unit of map {next(iter(group))}, "
+            run.log(f"{text}{len(dense.aligned)} of {len(dense.alignments)} keyframes aligned")
+        for map_id, reason in merged.meeting.alone().items():
+            run.log(f"map {map_id} joins no other: {reason}")
 
 
 def _map_and_frames(
@@ -492,7 +534,9 @@ def _map_and_frames(
     return fitted_to_frames(sparse_map, width, height, given), frames
 
 
-def _sparse(run: Run, frames: FrameSequence, config: SfmConfig) -> SparseMap:
+def _sparse(
+    run: Run, frames: FrameSequence, config: SfmConfig, poses: Mapping[int, np.ndarray] | None = None
+) -> SparseMap:
     stages: list[str] = []
 
     def show(stage: str, done: int, count: int) -> None:
@@ -500,16 +544,30 @@ def _sparse(run: Run, frames: FrameSequence, config: SfmConfig) -> SparseMap:
             stages.append(stage)
             run.log(f"sparse map: {stage}")
 
-    found = sparse_map_from_frames(frames, run.folder / "sparse", config, show)
+    found = sparse_map_from_frames(frames, run.folder / "sparse", config, show, poses)
     for submap in found.submaps:
         errors = number(float(np.median(submap.reprojection_errors())))
         run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
-    if found.unregistered:
+    if found.failed:
         run.log(
-            f"{len(found.unregistered)} of {len(frames)} frames found no place: {', '.join(found.unregistered[:8])}"
+            f"{len(found.failed)} of {len(frames)} frames found no place: {unmapped_summary(list(found.failed.values()))}"
         )
-    run.record["unregistered"] = list(found.unregistered)
+        for name, reason in found.failed.items():
+            run.log(f"  {name}: {reason}")
+    run.record["unregistered"] = found.failed
     return found
+
+
+def _poses(given: str, frames: FrameSequence) -> dict[int, np.ndarray]:
+    """Known poses (4, 4) by frame number."""
+    if given == "truth":
+        found = ((f.number, f.true_world_from_cam) for f in frames)
+        known = {number: pose for number, pose in found if pose is not None}
+        if not known:
+            raise InputError(f"{frames.source}: no frame has a pose; give --poses FILE, a TUM trajectory")
+        return known
+    times, poses = read_tum(Path(given))
+    return dict(zip(times.round().astype(int).tolist(), poses, strict=True))
 
 
 def _fitted_light(run: Run, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel) -> FrameSequence:

@@ -37,6 +37,19 @@ class Similarity:
     def apply(self, points: np.ndarray) -> np.ndarray:
         return self.scale * points @ self.rotation.T + self.translation
 
+    def __matmul__(self, first: Similarity) -> Similarity:
+        """self after first."""
+        moved = self.apply(first.translation[None])[0]
+        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, moved)
+
+    def inverse(self) -> Similarity:
+        back = self.rotation.T / self.scale
+        return Similarity(1 / self.scale, self.rotation.T, -back @ self.translation)
+
+    @classmethod
+    def identity(cls) -> Similarity:
+        return cls(1.0, np.eye(3), np.zeros(3))
+
 
 def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> Similarity:
     """The Sim(3), or SE(3), with the least squared error from source to target points (n, 3) (Umeyama 1991).

@@ -9,6 +9,7 @@ import numpy as np
 
 from densify.coverage import seen_well
 from densify.dense_map import DenseMap
+from densify.merge import Merged, joined_name
 from densify.pipeline import KeyframeView, SubmapResult
 from lightdepth.figures import (
     BAD,
@@ -104,6 +105,23 @@ def densify_page(
     return page
 
 
+def joined_section(page: Report, merged: Merged) -> None:
+    """Which submaps met and how, which did not and why, and the surfaces that they make together."""
+    page.heading("Submaps that meet")
+    rows = []
+    for j in merged.tried:
+        gap = j.surfaces.gap if j.surfaces else None
+        state = "joined" if j.ok else f"not joined: {j.reason}"
+        rows.append([f"maps {j.target} and {j.source}", j.by, f"{j.agreeing} of {j.matches}", gap, state])
+    page.table(["", "by", "correspondences that agree", "gap of the surfaces, share of the distance", ""], rows)
+    for result, group in zip(merged.results, merged.groups, strict=True):
+        maps = ", ".join(map(str, sorted(group)))
+        page.heading(f"Maps {maps} as one ({joined_name(result)})")
+        page.text(f"In the frame of reference and unit of map {next(iter(group))}; fused anew from all keyframes.")
+        if len(result.dense.triangles):
+            page.figures(mesh_pictures(result.dense, f"maps {maps}"))
+
+
 def _errors(page: Report, evaluation: Mapping[str, Any]) -> None:
     page.heading("Errors against the truth")
     page.text(
@@ -194,10 +212,11 @@ def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:
     page.wide_figures(gallery.pictures[dense.submap.id])
 
 
-def mesh_pictures(dense: DenseMap) -> list[tuple[bytes, str]]:
+def mesh_pictures(dense: DenseMap, name: str = "") -> list[tuple[bytes, str]]:
     """The surface from outside, and from the place of the middle keyframe."""
+    name = name or f"map {dense.submap.id}"
     surface = (dense.vertices, dense.triangles, dense.colors)
-    pictures = [(png(mesh_picture(*surface)), f"Surface of map {dense.submap.id} from outside")]
+    pictures = [(png(mesh_picture(*surface)), f"Surface of {name} from outside")]
     keyframes = dense.submap.keyframes
     middle = keyframes[len(keyframes) // 2]
     inside = mesh_picture(*surface, origin=middle.center, axes=middle.cam_from_map[:3, :3])

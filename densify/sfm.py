@@ -1,9 +1,10 @@
 """A sparse map from frames alone: structure from motion with COLMAP, for sequences that no SLAM has seen.
 
-Frames become PNG files with masks in a temporary folder; SIFT features are matched, verified and mapped incrementally
-with the calibration held fixed. What does not connect becomes a submap of its own, with its own scale. COLMAP knows no
-Scaramuzza camera: such a lens is replaced by the Kannala-Brandt camera that comes closest, and given back to the
-keyframes.
+Frames become PNG files with masks and evened contrast in a temporary folder; SIFT features are matched between frames
+that follow each other or look alike, verified, and mapped incrementally with the calibration held fixed. What does not
+connect becomes a submap of its own, with its own scale; a frame that finds no place is named with the likely reason.
+Where poses are known, points are only triangulated. COLMAP knows no Scaramuzza camera: such a lens is replaced by the
+Kannala-Brandt camera that comes closest, and given back to the keyframes.
 
 The only module that uses pycolmap. With one thread and a seed, as is the default, equal frames give equal maps.
 """
@@ -13,22 +14,26 @@ from __future__ import annotations
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from densify.retrieval import frame_pairs
+from densify.unmapped import Matching, reasons, summary
 from lightdepth.camera import CameraModel, KannalaBrandt, Scaramuzza
 from lightdepth.camera_conversion import Conversion, convert_camera
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, frame_number
+from lightdepth.importing.measures import Measures, Meter
 from lightdepth.maps import read_map
 from lightdepth.maps.colmap import holds_model
 from lightdepth.native import pycolmap
-from lightdepth.sparse_map import Keyframe, SparseMap, Submap
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap, check_rigid
 
 log = logging.getLogger(__name__)
 
@@ -51,9 +56,11 @@ class SfmConfig:
     mask_erosion_px: int = 4  # how far features keep from the border of the mask, pixels
     highlight: float = 0.98  # a pixel whose three channels all reach this, in [0, 1], is a highlight
     highlight_margin_px: int = 3  # how far features keep from a highlight, pixels
+    contrast: float = 2.0  # clip limit of CLAHE, which evens the contrast of dark and bright tissue; 0: as it is
     matching: Literal["auto", "sequential", "exhaustive"] = "auto"  # auto: exhaustive for few frames
     exhaustive_up_to: int = 40  # frames; with `auto`, longer sequences are matched sequentially
     overlap: int = 10  # frames matched ahead of each, when sequential
+    alike: int = 5  # frames matched with each besides, when sequential: those farther off that look most alike
     min_model_size: int = 3  # frames in the smallest submap
     min_points: int = 8  # points in the smallest submap
     init_min_tri_angle: float = 4.0  # least angle between the rays of the first pair, degrees
@@ -64,18 +71,27 @@ class SfmConfig:
 
 @dataclass(frozen=True)
 class SfmMap(SparseMap):
-    """A sparse map, and the names of the frames that found no place in it."""
+    """A sparse map, and the frames that found no place in it, by name, with the likely reason."""
 
-    unregistered: tuple[str, ...] = ()
+    failed: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def unregistered(self) -> tuple[str, ...]:
+        return tuple(self.failed)
 
 
 def sparse_map_from_frames(
-    frames: Sequence[Frame], out_folder: Path, config: SfmConfig | None = None, progress: Progress | None = None
+    frames: Sequence[Frame],
+    out_folder: Path,
+    config: SfmConfig | None = None,
+    progress: Progress | None = None,
+    poses: Mapping[int, np.ndarray] | None = None,
 ) -> SfmMap:
     """Frames -> submaps by number of frames, largest first, also written as COLMAP text models to out_folder/0, 1, ...
 
-    Keyframes are named by their frame's number, six digits, `.png`. Raises InputError, leaving out_folder as it was,
-    when the frames cannot be mapped or the folder already holds a map.
+    Keyframes are named by their frame's number, six digits, `.png`. With `poses`, map_from_cam (4, 4) by frame number,
+    nothing is moved: points are triangulated at these poses, in their unit, and there is one submap. Raises
+    InputError, leaving out_folder as it was, when the frames cannot be mapped or the folder already holds a map.
     """
     config, progress, out_folder = config or SfmConfig(), progress or _silent, Path(out_folder)
     _check_free(out_folder)
@@ -87,22 +103,54 @@ def sparse_map_from_frames(
             folder.mkdir()
         written = _write_images(frames, images, masks, config, progress)
         fit = fisheye_fit(written.camera, written.valid) if isinstance(written.camera, Scaramuzza) else None
-        count = _reconstruct(Path(work), fit.camera if fit else written.camera, sorted(written.names), config, progress)
+        camera, names = fit.camera if fit else written.camera, sorted(written.names)
+        known = None if poses is None else _known_poses(poses, written.names, fit)
+        matching = _features_and_matches(Path(work), camera, names, config, progress)
+        if known is None:
+            count = _reconstruct(Path(work), len(names), config, progress)
+        else:
+            count = _triangulated(Path(work), known, config, progress)
+        submaps = read_map(models).submaps if count else ()
+        if fit:
+            submaps = tuple(_with_camera(s, written.camera, fit.rotation) for s in submaps)
+        registered = {k.name for s in submaps for k in s.keyframes}
+        why = reasons(written.measures, matching, np.array([name in registered for name in names]))
+        failed = {written.names[name]: reason for name, reason in zip(names, why, strict=True) if reason}
+        if known is not None:
+            failed = {n: r if frame_file(n) in known else "it has no known pose" for n, r in failed.items()}
         if not count:
             raise InputError(
                 f"no sparse map could be made of {len(frames)} frames of {written.camera.width}x"
                 f"{written.camera.height}: COLMAP connected no {config.min_model_size} of them by "
-                f"{config.min_points} points. {_ADVICE}"
+                f"{config.min_points} points ({summary(why)}). {_ADVICE}"
             )
-        submaps = read_map(models).submaps
         _move_models(models, out_folder)
+    if failed:
+        log.warning("%d of %d frames are not in the map: %s", len(failed), len(frames), summary(list(failed.values())))
+    return SfmMap(submaps, str(out_folder), failed)
+
+
+def frame_file(name: str) -> str:
+    """The name of a frame's keyframe and image file."""
+    return f"{frame_number(name):06d}.png"
+
+
+def _known_poses(
+    poses: Mapping[int, np.ndarray], names: Mapping[str, str], fit: Conversion | None
+) -> dict[str, np.ndarray]:
+    """cam_from_map (4, 4) by file name, of the camera that COLMAP is given."""
+    turn = np.eye(4)
     if fit:
-        submaps = tuple(_with_camera(s, written.camera, fit.rotation) for s in submaps)
-    registered = {k.name for s in submaps for k in s.keyframes}
-    unregistered = tuple(frame_name for name, frame_name in sorted(written.names.items()) if name not in registered)
-    if unregistered:
-        log.warning("%d of %d frames are not in the map: %s", len(unregistered), len(frames), ", ".join(unregistered))
-    return SfmMap(submaps, str(out_folder), unregistered)
+        turn[:3, :3] = fit.rotation
+    known = {}
+    for name in names:
+        pose = poses.get(frame_number(name))
+        if pose is not None:
+            check_rigid(pose, f"pose of frame {frame_number(name)}")
+            known[name] = turn @ np.linalg.inv(pose)
+    if len(known) < 2:
+        raise InputError(f"{len(known)} of {len(names)} frames have a known pose; triangulation needs at least 2")
+    return known
 
 
 def fisheye_fit(camera: CameraModel, valid: np.ndarray) -> Conversion:
@@ -121,11 +169,13 @@ def fisheye_fit(camera: CameraModel, valid: np.ndarray) -> Conversion:
 
 @dataclass(frozen=True)
 class _Written:
-    """What went to the image folder: the camera, the valid pixels of the first frame, frame names by file name."""
+    """What went to the image folder: the camera, the valid pixels of the first frame, frame names by file name, and
+    what the images are like, in the order of file names."""
 
     camera: CameraModel
     valid: np.ndarray
     names: dict[str, str]
+    measures: Measures
 
 
 def _write_images(
@@ -135,6 +185,7 @@ def _write_images(
     import cv2
 
     first: Frame | None = None
+    meter: Meter | None = None
     names: dict[str, str] = {}
     for done, frame in enumerate(frames, 1):
         first = first or frame
@@ -142,21 +193,38 @@ def _write_images(
             raise InputError(
                 f"{frame.name}: another camera than {first.name}'s; map the frames of one camera at a time"
             )
-        name = f"{frame.number:06d}.png"
+        name = frame_file(frame.name)
         if name in names:
             raise InputError(f"{frame.name} and {names[name]} are both frame {frame.number}; numbers must be unique")
         names[name] = frame.name
         image = np.rint(255 * np.clip(frame.image, 0, 1)).astype(np.uint8)
+        meter = Meter(frame.valid) if meter is None else meter
+        meter.add(image)
         for folder, file, pixels in (
-            (images, name, image[..., ::-1]),
+            (images, name, evened(image, frame.valid, config.contrast)[..., ::-1]),
             (masks, f"{name}.png", 255 * usable_pixels(frame, config).astype(np.uint8)),
         ):
             if not cv2.imwrite(str(folder / file), pixels):
                 raise InputError(f"{folder / file}: cannot be written; is the disk full?")
         progress("images", done, len(frames))
-    if first is None or len(names) < config.min_model_size:
+    if first is None or meter is None or len(names) < config.min_model_size:
         raise InputError(f"{len(names)} frames; a sparse map needs at least {config.min_model_size}. {_ADVICE}")
-    return _Written(first.camera, first.valid, names)
+    order, found = np.argsort(list(names)), meter.result()
+    measures = Measures(*(getattr(found, f.name)[order] for f in fields(Measures)))
+    return _Written(first.camera, first.valid, names, measures)
+
+
+def evened(image: np.ndarray, valid: np.ndarray, limit: float) -> np.ndarray:
+    """(H, W, 3) uint8 with the contrast of its lightness evened out (CLAHE), so that the dark far wall and the bright
+    near one have features alike. Outside the valid pixels (H, W) the mean stands: a black frame would be evened too."""
+    import cv2
+
+    if not limit or not valid.any():
+        return image
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+    lightness = np.where(valid, lab[..., 0], np.uint8(lab[..., 0][valid].mean()))
+    lab[..., 0] = cv2.createCLAHE(limit, (8, 8)).apply(lightness)
+    return cv2.cvtColor(lab, cv2.COLOR_LAB2RGB)
 
 
 def usable_pixels(frame: Frame, config: SfmConfig) -> np.ndarray:
@@ -171,36 +239,103 @@ def usable_pixels(frame: Frame, config: SfmConfig) -> np.ndarray:
     return ~(grown(~frame.valid, config.mask_erosion_px) | grown(highlight, config.highlight_margin_px))
 
 
-def _reconstruct(work: Path, camera: CameraModel, names: list[str], config: SfmConfig, progress: Progress) -> int:
-    """Runs COLMAP on work/images and work/masks; writes its models as text to work/models/<i>, returns how many."""
-    pc, count = pycolmap(), len(names)
-    database = work / "database.db"
+def _features_and_matches(
+    work: Path, camera: CameraModel, names: list[str], config: SfmConfig, progress: Progress
+) -> Matching:
+    """Fills work/database.db from work/images and work/masks; what there was to match, frames by place in names."""
+    pc, database = pycolmap(), work / "database.db"
     with _quiet(pc):
         pc.set_random_seed(config.seed)
         _extract(pc, work, database, camera, names, config, progress)
-        progress("matches", 0, count)
-        _match(pc, database, count, config)
-        progress("matches", count, count)
-        registered = 0
+        with pc.Database.open(database) as opened:
+            ids = [opened.read_image_with_name(name).image_id for name in names]
+            features = np.array([opened.num_keypoints_for_image(i) for i in ids])
+            pairs = _pairs(opened, ids, config)
+        _match(pc, work, [(names[i], names[j]) for i, j in pairs], config, progress)
+        place = {image_id: k for k, image_id in enumerate(ids)}
+        flat = pc.TwoViewGeometryConfiguration
+        flat = {int(v) for v in (flat.PLANAR, flat.PANORAMIC, flat.PLANAR_OR_PANORAMIC)}
+        found = []
+        with pc.Database.open(database) as opened:
+            for pair_id, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+                if len(geometry.inlier_matches):
+                    one, other = (place[i] for i in pc.pair_id_to_image_pair(pair_id))
+                    found.append((one, other, len(geometry.inlier_matches), int(geometry.config) in flat))
+    rows = np.array(found, int).reshape(-1, 4)
+    return Matching(features, rows[:, :2], rows[:, 2], rows[:, 3] > 0)
 
-        def one_more() -> None:
-            nonlocal registered
-            registered = min(registered + 1, count)
-            progress("mapping", registered, count)
 
-        (work / "colmap").mkdir()
-        options = _mapping_options(pc, config)
+def _pairs(database: Any, ids: list[int], config: SfmConfig) -> list[tuple[int, int]]:
+    exhaustive = config.matching == "exhaustive"
+    if exhaustive or (config.matching == "auto" and len(ids) <= config.exhaustive_up_to):
+        return list(combinations(range(len(ids)), 2))
+    descriptors = (
+        [np.asarray(database.read_descriptors(i).data) for i in ids] if config.alike else [np.zeros(0)] * len(ids)
+    )
+    return frame_pairs(descriptors, config.overlap, config.alike, config.seed)
+
+
+def _reconstruct(work: Path, count: int, config: SfmConfig, progress: Progress) -> int:
+    """Maps what work/database.db holds; writes the models as text to work/models/<i>, returns how many."""
+    pc = pycolmap()
+    registered = 0
+
+    def one_more() -> None:
+        nonlocal registered
+        registered = min(registered + 1, count)
+        progress("mapping", registered, count)
+
+    (work / "colmap").mkdir()
+    with _quiet(pc):
         models = pc.incremental_mapping(
-            database, work / "images", work / "colmap", options, next_image_callback=one_more
+            work / "database.db",
+            work / "images",
+            work / "colmap",
+            _mapping_options(pc, config),
+            next_image_callback=one_more,
         )
         large = [m for m in models.values() if m.num_reg_images() >= config.min_model_size]
         large = [m for m in large if m.num_points3D() >= config.min_points]
         for index, model in enumerate(sorted(large, key=lambda m: -m.num_reg_images())):
-            folder = work / "models" / str(index)
-            folder.mkdir()
-            model.write_text(folder)
-        progress("mapping", count, count)
+            _write_model(model, work, index)
+    progress("mapping", count, count)
     return len(large)
+
+
+def _triangulated(work: Path, known: Mapping[str, np.ndarray], config: SfmConfig, progress: Progress) -> int:
+    """Triangulates the matches at known cam_from_map (4, 4) by file name; writes the model, returns 1, or 0 without."""
+    pc, database = pycolmap(), work / "database.db"
+    (work / "colmap").mkdir()
+    progress("mapping", 0, len(known))
+    with _quiet(pc):
+        model = pc.Reconstruction()
+        with pc.Database.open(database) as opened:
+            (camera,) = opened.read_all_cameras()
+            model.add_camera_with_trivial_rig(camera)
+            for name, pose in sorted(known.items()):
+                image_id = opened.read_image_with_name(name).image_id
+                image = pc.Image(name=name, camera_id=camera.camera_id, image_id=image_id)
+                model.add_image_with_trivial_frame(image, pc.Rigid3d(pose[:3]))
+        model = pc.triangulate_points(
+            model,
+            database,
+            work / "images",
+            work / "colmap",
+            clear_points=True,
+            options=_mapping_options(pc, config),
+            refine_intrinsics=False,
+        )
+        if model.num_points3D() < config.min_points:
+            return 0
+        _write_model(model, work, 0)
+    progress("mapping", len(known), len(known))
+    return 1
+
+
+def _write_model(model: Any, work: Path, index: int) -> None:
+    folder = work / "models" / str(index)
+    folder.mkdir()
+    model.write_text(folder)
 
 
 def _extract(
@@ -228,18 +363,24 @@ def _extract(
     progress("features", len(names), len(names))
 
 
-def _match(pc: Any, database: Path, count: int, config: SfmConfig) -> None:
+def _match(pc: Any, work: Path, pairs: list[tuple[str, str]], config: SfmConfig, progress: Progress) -> None:
+    """Matches and verifies the pairs of images, a piece at a time, for progress and so that an interrupt is heard."""
     matching, verification = pc.FeatureMatchingOptions(), pc.TwoViewGeometryOptions()
     matching.use_gpu, matching.num_threads = False, config.num_threads
     verification.ransac.random_seed, verification.detect_watermark = config.seed, False
-    options = {"matching_options": matching, "verification_options": verification, "device": pc.Device.cpu}
-    exhaustive = config.matching == "exhaustive" or (config.matching == "auto" and count <= config.exhaustive_up_to)
-    if exhaustive:
-        pc.match_exhaustive(database, **options)
-    else:
-        pairing = pc.SequentialPairingOptions()
-        pairing.overlap, pairing.quadratic_overlap = config.overlap, False
-        pc.match_sequential(database, pairing_options=pairing, **options)
+    pairing, piece = pc.ImportedPairingOptions(), 100
+    pairing.match_list_path = work / "pairs.txt"
+    for start in range(0, len(pairs), piece):
+        progress("matches", start, len(pairs))
+        (work / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs[start : start + piece]))
+        pc.match_image_pairs(
+            work / "database.db",
+            matching_options=matching,
+            pairing_options=pairing,
+            verification_options=verification,
+            device=pc.Device.cpu,
+        )
+    progress("matches", len(pairs), len(pairs))
 
 
 def _mapping_options(pc: Any, config: SfmConfig) -> Any:

@@ -150,6 +150,18 @@ def test_a_run_has_a_surface_for_every_map_a_report_and_its_figures(run):
     assert not list(run.parent.glob(".dense-*"))
 
 
+def test_maps_that_share_frames_are_joined_besides_and_the_transform_is_in_run_json(run, data):
+    assert {"mesh.ply", "cloud.ply", "sparse.ply", "keyframes.csv"} <= set(left_in(run / "joined_000"))
+    record = json.loads((run / "run.json").read_text())["merge"]
+    (joined,) = record["joined"]
+    assert sorted(joined["maps"]) == [0, 1] and record["alone"] == {} and record["joins"][0]["by"] == "points"
+    (transform,) = joined["transforms"]
+    known = json.loads((data / "truth" / "slam.json").read_text())
+    first, second = (known[str(transform[k])]["scale"] for k in ("first", "second"))
+    assert transform["scale"] == pytest.approx(second / first, rel=0.05)
+    assert "Maps 0, 1 as one" in (run / "report.html").read_text()
+
+
 def test_evaluate_writes_the_tables_into_the_run_and_again_without_asking(run, data, capsys):
     assert lightdepth("evaluate", run, "--truth", data) == 0
     shown = capsys.readouterr().out
@@ -327,7 +339,7 @@ def test_frames_without_a_map_are_mapped_and_made_dense(tmp_path, capfd):
     assert lightdepth("densify", tmp_path / "seq", "--checkpoint", "decline", "-o", tmp_path / "out") == 0
     assert {"sparse", "map_000", "report.html"} <= set(left_in(tmp_path / "out"))
     record = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert record["maps"][0]["aligned"] >= 6 and record["unregistered"] == []
+    assert record["maps"][0]["aligned"] >= 6 and record["unregistered"] == {}
     assert record["maps"][0]["withheld"]["median"] < 0.2
     assert lightdepth("evaluate", tmp_path / "out", "--truth", tmp_path / "seq") == 0
 

@@ -112,8 +112,8 @@ def test_the_written_model_is_the_returned_one(mapped):
 def test_progress_goes_through_the_stages_to_their_ends(mapped):
     stages = mapped[2]
     assert list(dict.fromkeys(s for s, _, _ in stages)) == ["images", "features", "matches", "mapping"]
-    for stage in ("images", "features", "matches", "mapping"):
-        assert [(d, n) for s, d, n in stages if s == stage][-1] == (8, 8)
+    for stage, total in (("images", 8), ("features", 8), ("matches", 28), ("mapping", 8)):
+        assert [(d, n) for s, d, n in stages if s == stage][-1] == (total, total)
 
 
 def test_nothing_is_left_beside_the_map_and_a_second_map_is_refused_there(mapped):

@@ -1,0 +1,76 @@
+"""Many similarities at once, and the one that most of a set of correspondences agree with.
+
+Notation: X_target = s R X_source + t. Points are (n, 3).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from densify.evaluation import Similarity
+
+
+def umeyama(
+    source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scales (...), rotations (..., 3, 3) and translations (..., 3) with the least weighted squared error from source
+    to target points (..., n, 3), weights (..., n) (Umeyama 1991). Many at once; degenerate ones give any rotation."""
+    w = np.ones(source.shape[:-1]) if weights is None else weights
+    w = (w / w.sum(-1, keepdims=True))[..., None]
+    mean_s, mean_t = ((w * points).sum(-2, keepdims=True) for points in (source, target))
+    s, t = source - mean_s, target - mean_t
+    u, d, vt = np.linalg.svd(np.swapaxes(w * t, -1, -2) @ s)
+    sign = np.ones(d.shape)
+    sign[..., 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    rotation = (u * sign[..., None, :]) @ vt
+    scale = (d * sign).sum(-1) / (w * s**2).sum((-1, -2)).clip(min=1e-300)
+    turned = (rotation @ np.swapaxes(mean_s, -1, -2))[..., 0]
+    return scale, rotation, mean_t[..., 0, :] - scale[..., None] * turned
+
+
+def robust_similarity(
+    source: np.ndarray,
+    target: np.ndarray,
+    tolerance: np.ndarray,
+    rng: np.random.Generator,
+    trials: int = 2000,
+    scales: tuple[float, float] = (0.0, np.inf),
+) -> tuple[Similarity, np.ndarray] | None:
+    """The Sim(3) that most of the correspondences agree with, and which do (n,): within `tolerance` (n,), in the
+    target's unit.
+
+    Triples whose sides are in proportion are tried, `trials` of them drawn by rng; the one of the least truncated
+    squared error (MSAC; Torr and Zisserman 2000) is refined on what agrees with it, by Cauchy weights. None when no
+    triple, or none with a scale in the range, will do.
+    """
+    n = len(source)
+    if n < 3:
+        return None
+    rows = rng.integers(0, n, (trials, 3))
+    three_s, three_t = source[rows], target[rows]
+    sides = [np.linalg.norm(p - np.roll(p, 1, axis=1), axis=-1) for p in (three_s, three_t)]  # (trials, 3) each
+    ratio = sides[1] / np.where(sides[0] > 0, sides[0], np.inf)
+    long = sides[1].min(1) > 3 * tolerance[rows].max(1)
+    ratio = ratio[long]
+    alike = (ratio.max(1) < 1.3 * ratio.min(1)) & (ratio.mean(1) > scales[0]) & (ratio.mean(1) < scales[1])
+    scale, rotation, translation = umeyama(three_s[long][alike], three_t[long][alike])
+    if not len(scale):
+        return None
+    best, least = None, np.inf
+    judges = rng.permutation(n)[:1000]
+    for part in np.array_split(np.arange(len(scale)), -(-len(scale) // 256)):
+        moved = np.einsum("hij,nj->hni", rotation[part] * scale[part, None, None], source[judges])
+        error = ((moved + translation[part, None] - target[judges]) ** 2).sum(-1) / tolerance[judges] ** 2
+        cost = np.minimum(error, 1).mean(1)
+        if cost.min() < least:
+            best, least = part[cost.argmin()], cost.min()
+    found = Similarity(float(scale[best]), rotation[best], translation[best])
+    for _ in range(10):
+        error = np.linalg.norm(found.apply(source) - target, axis=1) / tolerance
+        agrees = error <= 1
+        if agrees.sum() < 3:
+            return None
+        weights = agrees / (1 + (3 * error) ** 2) / tolerance**2
+        s, r, t = umeyama(source, target, weights)
+        found = Similarity(float(s), r, t)
+    return found, np.linalg.norm(found.apply(source) - target, axis=1) <= tolerance
