@@ -549,9 +549,8 @@ def _sparse(
         errors = number(float(np.median(submap.reprojection_errors())))
         run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
     if found.failed:
-        run.log(
-            f"{len(found.failed)} of {len(frames)} frames found no place: {unmapped_summary(list(found.failed.values()))}"
-        )
+        reasons = unmapped_summary(list(found.failed.values()))
+        run.log(f"{len(found.failed)} of {len(frames)} frames found no place: {reasons}")
         for name, reason in found.failed.items():
             run.log(f"  {name}: {reason}")
     run.record["unregistered"] = found.failed

@@ -157,7 +157,7 @@ def test_maps_that_share_frames_are_joined_besides_and_the_transform_is_in_run_j
     assert sorted(joined["maps"]) == [0, 1] and record["alone"] == {} and record["joins"][0]["by"] == "points"
     (transform,) = joined["transforms"]
     known = json.loads((data / "truth" / "slam.json").read_text())
-    first, second = (known[str(transform[k])]["scale"] for k in ("first", "second"))
+    first, second = (known[str(transform[k])]["map_from_world"]["scale"] for k in ("first", "second"))
     assert transform["scale"] == pytest.approx(second / first, rel=0.05)
     assert "Maps 0, 1 as one" in (run / "report.html").read_text()
 
