@@ -492,7 +492,8 @@ def _descriptors(side: _Side, per_point: int = 3, window: float = 0.05) -> tuple
         wanted = seen[own] < per_point
         try:
             frame = side.frames.by_number(keyframe.number)
-        except InputError:
+            frame = None if frame is None else replace(frame, camera=keyframe.camera)
+        except InputError:  # unreadable, or of another size: its reason is in keyframes.csv
             continue
         if frame is None or not wanted.any():
             continue

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.sfm import SfmConfig, fisheye_fit, sparse_map_from_frames, usable_pixels
+from densify.sfm import SfmConfig, evened, fisheye_fit, sparse_map_from_frames, usable_pixels
 from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
@@ -197,3 +197,47 @@ def test_a_png_can_be_written_after_pycolmap_was_loaded(tmp_path):
     root = Path(__file__).resolve().parents[1]
     done = subprocess.run([sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_long_sequences_are_matched_by_looks_too_and_give_the_same_map_twice(tmp_path):
+    config = SfmConfig(matching="sequential", overlap=2, alike=1, max_features=800)
+    frames = film(PINHOLE, 6)
+    first, second = (sparse_map_from_frames(frames, tmp_path / name, config) for name in ("a", "b"))
+    for a, b in zip(first.submaps, second.submaps, strict=True):
+        assert np.array_equal(a.points, b.points)
+        for one, other in zip(a.keyframes, b.keyframes, strict=True):
+            assert np.array_equal(one.cam_from_map, other.cam_from_map)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, SCARAMUZZA], ids=lambda c: c.name)
+def test_known_poses_stay_as_they_are_and_the_points_lie_on_the_walls_in_their_unit(camera, tmp_path):
+    frames = film(camera, 4)
+    poses = {10 + k: pose(k) for k in range(3)}
+    found = sparse_map_from_frames(frames, tmp_path / "sparse", SfmConfig(max_features=800), poses=poses)
+    (submap,) = found.submaps
+    for keyframe in submap.keyframes:
+        np.testing.assert_allclose(keyframe.cam_from_map @ poses[keyframe.number], np.eye(4), atol=1e-9)
+    assert np.median(np.abs(np.abs(submap.points) - HALF).min(1)) < 0.3
+    assert found.failed == {"13_color": "it has no known pose"}
+
+
+def test_poses_of_other_frames_are_refused(tmp_path):
+    with pytest.raises(InputError, match="0 of 3 frames have a known pose; triangulation needs at least 2"):
+        sparse_map_from_frames(film(PINHOLE, 3), tmp_path / "sparse", poses={99: np.eye(4)})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_contrast_is_evened_inside_the_mask_and_left_alone_on_request():
+    rng = np.random.default_rng(0)
+    image = np.full((64, 64, 3), 40, np.uint8) + rng.integers(0, 6, (64, 64, 1)).astype(np.uint8)
+    valid = np.ones((64, 64), bool)
+    valid[:, :16] = False
+    assert evened(image, valid, 2.0)[:, 20:].std() > 1.5 * image[:, 20:].std()
+    assert evened(image, valid, 0) is image
+
+
+def test_a_video_with_a_cut_in_the_middle_gives_two_submaps(tmp_path):
+    sheets = np.random.default_rng(5).permutation(texture(), axis=0)[:, ::-1]
+    other = [Frame(f"{6 + k}", render(PINHOLE, pose(k + 12), 1 - sheets), PINHOLE) for k in range(6)]
+    found = sparse_map_from_frames([*film(PINHOLE, 6, 0), *other], tmp_path / "sparse", SfmConfig(max_features=1500))
+    assert sorted([k.number for k in s.keyframes] for s in found.submaps) == [list(range(6)), list(range(6, 12))]

@@ -1,4 +1,4 @@
-"""Structure from motion on 12 synthetic videos: what share is mapped, how true the trajectory is. Run by `make bench`."""
+"""Structure from motion on 12 synthetic videos: the share that is mapped and its trajectory error. By `make bench`."""
 
 import sys
 import tempfile
