@@ -46,6 +46,13 @@ class Surface:
         distance = found["t_hit"].numpy().astype(np.float64)
         return distance, np.where(np.isfinite(distance), found["primitive_ids"].numpy().astype(int), -1)
 
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance (n,) from points (n, 3) to the closest of the surface, in single precision; infinite without any."""
+        if self._scene is None or not len(points):
+            return np.full(len(points), np.inf)
+        found = self._scene.compute_distance(self._core.Tensor(points.astype(np.float32)))
+        return found.numpy().astype(np.float64)
+
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The points (n, 3) of the surface that are closest to points (n, 3), and their triangles (n,)."""
         assert self._scene is not None, "a surface without triangles has no points"
