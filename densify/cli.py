@@ -44,7 +44,7 @@ from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, fitted_t
 from densify.pipeline import densify as densify_maps
 from densify.rectify import RectifyConfig
 from densify.sfm import SfmConfig, sparse_map_from_frames
-from densify.suite import present, read_suite
+from densify.suite import Suite, present, read_suite
 from densify.tables import write_evaluations
 from densify.trajectory import read_trajectories, trajectory_files
 from densify.unmapped import summary as unmapped_summary
@@ -240,7 +240,8 @@ def evaluate(
         )
     if suite is not None and (truth is None or trajectory or truth_mesh or join):
         raise InputError("--suite needs --truth, and goes with neither --trajectory, --truth-mesh nor --join")
-    columns, missing = None, {}
+    columns: Suite | None = None
+    missing: dict[str, str] = {}
     pairs = {truth.name: (run, truth)} if truth is not None else {}
     if suite is not None and truth is not None:
         columns = read_suite(suite)

@@ -87,8 +87,8 @@ def read_suite(path: Path) -> Suite:
                 f"{path}: published row {row!r} has {len(values)} values; expected {expected}: each sequence, and the "
                 "mean of each group"
             )
-    for method, values in found.published.depth.items():
-        odd = sorted(set(values) - set(NAMES))
+    for method, errors in found.published.depth.items():
+        odd = sorted(set(errors) - set(NAMES))
         if odd:
             raise InputError(f"{path}: published depth of {method}: {odd[0]}; expected one of {', '.join(NAMES)}")
     p = found.published

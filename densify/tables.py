@@ -150,15 +150,19 @@ def completeness_table(results: Results, suite: Suite | None = None) -> Table:
     suite = suite or alone(list(results))
     figures: dict[str, Callable[[Mapping[str, Any]], Any]] = {}
     for title, name in (("RMS", "rms_mm"), ("Median", "median_mm")):
-        figures[f"{title} to true mesh"] = lambda f, name=name: f["to_mesh"] and f["to_mesh"][name]
-        figures[f"{title} from truth (completeness)"] = lambda f, name=name: f["completeness"][name]
+        figures[f"{title} to true mesh"] = _figure("to_mesh", name)
+        figures[f"{title} from truth (completeness)"] = _figure("completeness", name)
     for result in results.values():
         thresholds = [f"{t:g}mm" for t in result["thresholds_mm"]]
     for what, title in (("precision", "Precision"), ("recall", "Recall"), ("f_score", "F-score")):
         for t in thresholds:
-            figures[f"{title} {t}"] = lambda f, what=what, t=t: f[what][t]
+            figures[f"{title} {t}"] = _figure(what, t)
     title = "Table 3. Maps. Distances in mm; precision, recall: shares of model and true points within the threshold."
     return Table(title, _headers(suite.surface_groups, "Method", "Metrics"), _model_rows(results, suite, figures))
+
+
+def _figure(what: str, key: str) -> Callable[[Mapping[str, Any]], Any]:
+    return lambda found: found[what] and found[what][key]
 
 
 def _model_rows(
@@ -187,8 +191,8 @@ def depth_table(results: Results, suite: Suite | None = None) -> Table:
             values = [[r["mean"][f"{key}_{alignment}"] for r in results.values()] for key in _METRICS]
             rows.append([label, "mean over sequences", *(float(np.mean(v)) for v in values)])
             rows.append([label, "mean over frames", *(float(np.average(v, weights=weights)) for v in values)])
-    for method, values in (suite.depth if suite else {}).items():
-        rows.append(["not stated", method, *(values.get(key) for key in _METRICS)])
+    for method, published in (suite.depth if suite else {}).items():
+        rows.append(["not stated", method, *(published.get(key) for key in _METRICS)])
     return Table("Depth errors. Mean over frames.", ["Alignment", "Sequence", *_METRICS.values()], rows)
 
 
