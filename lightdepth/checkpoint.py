@@ -19,7 +19,7 @@ from lightdepth.errors import InputError
 from lightdepth.network import DepthNetwork, NetworkConfig, build_network
 from lightdepth.predict import ConstantModel, DeclineModel, DepthModel, NetworkModel
 
-DEFAULT_CHECKPOINT = "lightdepth-self"
+DEFAULT_CHECKPOINT = "lightdepth-synthetic"
 TRAINING_FREE: dict[str, type[DeclineModel] | type[ConstantModel]] = {
     "decline": DeclineModel,
     "constant": ConstantModel,
