@@ -11,6 +11,7 @@ _HOMES = {
     "DenseMap": "densify.dense_map",
     "Alignment": "densify.alignment",
     "TsdfVolume": "densify.fusion",
+    "Densifier": "densify.live",
 }
 __all__ = list(_HOMES)
 

@@ -155,6 +155,32 @@ class TsdfVolume:
             setattr(self, name, np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)]))
         self._free = list(range(held + more - 1, held - 1, -1))
 
+    def slots(self, places: np.ndarray) -> np.ndarray:
+        """Where blocks (n, 3) are held (n,); -1 where there is none."""
+        return np.array([self._rows.get((x, y, z), -1) for x, y, z in places.tolist()], int)
+
+    def sides(self, slots: np.ndarray) -> np.ndarray:
+        """Of held blocks (n,): 1 has voxels behind the surface, 2 before it, 3 both: only there is any surface."""
+        known, behind = self._known(slots), self._distance[slots] < 0
+        return (known & behind).any(1) + np.uint8(2) * (known & ~behind).any(1)
+
+    def values(self, slots: np.ndarray) -> np.ndarray:
+        """Signed distance (n, 8, 8, 8) of held blocks (n,) in truncations, NaN where too few views have seen it."""
+        mean = self._distance[slots] / np.maximum(self._weight[slots], 1).astype(np.float32) / np.float32(STEPS)
+        return np.where(self._known(slots), mean, np.float32(np.nan)).reshape(-1, BLOCK, BLOCK, BLOCK)
+
+    def color_sums(self, voxels: np.ndarray) -> np.ndarray:
+        """Weighted sums of red, green, blue (0 to 255) and of the weights (n, 4), at voxels 512 slot + place (n,)."""
+        return self._color.reshape(-1, 4).take(voxels, 0)
+
+    def _known(self, slots: np.ndarray) -> np.ndarray:
+        return (self._weight[slots] > 0) & (self._seen[slots] >= self._config.min_views)
+
+    @property
+    def capacity(self) -> int:
+        """Places for blocks, used or not: slots are below it."""
+        return len(self._weight)
+
     @property
     def blocks(self) -> set[Block]:
         """Places of all blocks that hold anything."""

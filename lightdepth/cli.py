@@ -30,6 +30,7 @@ ORDER = (
     "predict",
     "sparse",
     "densify",
+    "live",
     "evaluate",
 )
 FILES = ("calibrate-light", "convert-camera", "select")

@@ -63,6 +63,7 @@ def test_help_lists_the_verbs_in_the_order_of_the_work_each_with_its_line(capsys
         "predict",
         "sparse",
         "densify",
+        "live",
         "evaluate",
     ]
     assert all(len(line.split()) > 4 for line in lines if line.startswith("  "))
@@ -80,7 +81,7 @@ def test_a_mistyped_verb_is_told_which_was_meant(capsys):
     assert lightdepth("cook") == 2 and "expected one of demo, doctor" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("verb", ["demo", "synth", "predict", "sparse", "densify", "evaluate"])
+@pytest.mark.parametrize("verb", ["demo", "synth", "predict", "sparse", "densify", "live", "evaluate"])
 def test_every_verb_explains_its_options(verb, capsys):
     assert lightdepth(verb, "--help") == 0
     shown = capsys.readouterr().out

@@ -1,0 +1,178 @@
+"""A recorded sequence played against the clock: what a live surface would have cost, keyframe by keyframe.
+
+Keyframes come in the order of the recording, submap after submap. A keyframe's time is all that happens between its
+arrival and the renewed surface: reading the image, inference, alignment, integration, marching cubes.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from densify.dense_map import DenseMap
+from densify.live import STEPS, Densifier, StepTime
+from densify.pipeline import DensifyConfig, Model, _frame_of
+from lightdepth.datasets import FrameSequence
+from lightdepth.errors import InputError
+from lightdepth.figures import chart, chart_png
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap
+
+ALL_STEPS = ("read", *STEPS)
+_COLORS = ("#b8b8b8", "#2a6f97", "#e09f3e", "#9e2a2b", "#5a8f5a")
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """One keyframe. `times` by step; `arrival` and `done` in seconds since the first; `renewed` blocks were looked at
+    again, `patches` hold the surface. `reason` says why it took no part, `unread` that its image was not there."""
+
+    map: int
+    keyframe: str
+    times: Mapping[str, StepTime]
+    arrival: float
+    done: float
+    renewed: int
+    patches: int
+    kept_bytes: int
+    reason: str = ""
+    unread: bool = False
+
+    @property
+    def total(self) -> StepTime:
+        return sum(self.times.values(), StepTime())
+
+
+def play(
+    frames: FrameSequence,
+    sparse_map: SparseMap,
+    model: Model,
+    config: DensifyConfig,
+    on_map: Callable[[DenseMap], None],
+    rate: float | None = None,
+    on_keyframe: Callable[[Played], None] | None = None,
+) -> list[Played]:
+    """All keyframes, one by one; `on_map` is given each submap's surface when its last keyframe is done.
+
+    With `rate` [keyframes per second] the n-th keyframe is not there before n / rate seconds, and waits while an
+    earlier one is worked on; without, each comes when the last is done. Only one submap is held at a time.
+    """
+    if rate is not None and not rate > 0:
+        raise InputError(f"rate {rate}; expected keyframes per second, above 0")
+    submaps = sorted(sparse_map.submaps, key=lambda s: min(k.number for k in s.keyframes))
+    Densifier(model, config).warm_up(submaps[0].keyframes[0].camera)
+    played: list[Played] = []
+    start = time.perf_counter()
+    for submap in submaps:
+        densifier = Densifier(model, config, submap.id)
+        for keyframe in sorted(submap.keyframes, key=lambda k: k.number):
+            arrival = time.perf_counter() - start
+            if rate is not None:
+                time.sleep(max(0.0, len(played) / rate - arrival))
+                arrival = len(played) / rate
+            played.append(_play_one(densifier, submap, keyframe, frames, arrival, start))
+            if on_keyframe is not None:
+                on_keyframe(played[-1])
+        if densifier.alignments:
+            on_map(densifier.dense_map())
+    return played
+
+
+def _play_one(
+    densifier: Densifier, submap: Submap, keyframe: Keyframe, frames: FrameSequence, arrival: float, start: float
+) -> Played:
+    wall, cpu = time.perf_counter(), time.process_time()
+    frame, reason = _frame_of(keyframe, frames)
+    densifier.times = {"read": StepTime(time.perf_counter() - wall, time.process_time() - cpu)}
+    if frame is not None:
+        rows, there = submap.rows_of(keyframe.point_ids)
+        observed = replace(keyframe, pixels=keyframe.pixels[there], point_ids=keyframe.point_ids[there])
+        try:
+            reason = densifier.add_keyframe(frame, observed, submap.points[rows[there]]).reason
+        except InputError as error:
+            reason = str(error)
+    mesh = densifier.mesh()
+    return Played(
+        map=submap.id,
+        keyframe=keyframe.name,
+        times=dict(densifier.times),
+        arrival=arrival,
+        done=time.perf_counter() - start,
+        renewed=len(mesh.renewed),
+        patches=len(mesh.patches),
+        kept_bytes=densifier.kept_bytes,
+        reason=reason,
+        unread=frame is None,
+    )
+
+
+def time_spent(played: Sequence[Played], budget: float) -> dict[str, Any]:
+    """Figures of a run, in milliseconds: per step the median and the 95th percentile on the clock, and the median of
+    processor time; the share of keyframes whose time is at most `budget` [s], and whose surface was there that long
+    after their arrival."""
+    shown = [p for p in played if not p.unread]
+    if not shown:
+        return {"keyframes": len(played), "read": 0}
+
+    def figures(times: Iterable[StepTime]) -> dict[str, float]:
+        wall, cpu = (1000 * np.array(a) for a in zip(*((t.wall, t.cpu) for t in times), strict=True))
+        named = {"median_ms": np.median(wall), "p95_ms": np.quantile(wall, 0.95), "cpu_ms": np.median(cpu)}
+        return {name: float(value) for name, value in named.items()}
+
+    without = [sum((t for step, t in p.times.items() if step != "predict"), StepTime()) for p in shown]
+    return {
+        "keyframes": len(played),
+        "read": len(shown),
+        "budget_ms": 1000 * budget,
+        "share_in_budget": float(np.mean([p.total.wall <= budget for p in shown])),
+        "share_in_time": float(np.mean([p.done - p.arrival <= budget for p in shown])),
+        "steps": {step: figures([p.times.get(step, StepTime()) for p in shown]) for step in ALL_STEPS},
+        "without_network": figures(without),
+        "total": figures([p.total for p in shown]),
+        "kept_bytes": sum({p.map: p.kept_bytes for p in shown}.values()),
+    }
+
+
+def write_timings(played: Sequence[Played], path: Path) -> None:
+    """A table with a row for each keyframe; times in milliseconds, `cpu_…` of all threads together."""
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        steps = [f"{kind}{step}_ms" for kind in ("", "cpu_") for step in (*ALL_STEPS, "total")]
+        table.writerow(
+            ["map", "keyframe", "arrival_s", "done_s", *steps, "blocks_renewed", "patches", "kept_kb", "reason"]
+        )
+        for p in played:
+            times = [*(p.times.get(step, StepTime()) for step in ALL_STEPS), p.total]
+            row = [f"{1000 * value:.2f}" for kind in ("wall", "cpu") for value in (getattr(t, kind) for t in times)]
+            when = [f"{p.arrival:.3f}", f"{p.done:.3f}"]
+            table.writerow([p.map, p.keyframe, *when, *row, p.renewed, p.patches, p.kept_bytes // 1000, p.reason])
+
+
+def timings_picture(played: Sequence[Played], budget: float) -> bytes:
+    """PNG: what each keyframe's time went into, on the clock, beside the budget [s] and the processor time."""
+    figure, axes = chart((9.0, 3.6))
+    place = np.arange(len(played))
+    bottom = np.zeros(len(played))
+    names = {"predict": "inference", "align": "alignment", "integrate": "integration", "extract": "marching cubes"}
+    for step, color in zip(ALL_STEPS, _COLORS, strict=True):
+        height = np.array([1000 * p.times.get(step, StepTime()).wall for p in played])
+        label = f"{names.get(step, 'reading')}, median {np.median(height):.1f} ms"
+        axes.bar(place, height, 1.0, bottom, color=color, linewidth=0, label=label)
+        bottom += height
+    cpu = np.array([1000 * p.total.cpu for p in played])
+    axes.plot(place, cpu, ".", color="black", markersize=2, label=f"processor, median {np.median(cpu):.0f} ms")
+    axes.axhline(1000 * budget, color="black", linewidth=1, linestyle="--", label=f"budget {1000 * budget:g} ms")
+    for before, after in zip(place[:-1], place[1:], strict=True):
+        if played[before].map != played[after].map:
+            axes.axvline(after - 0.5, color="white", linewidth=1)
+    axes.set_xlim(-0.5, len(played) - 0.5)
+    axes.set_ylim(0, max(1.15 * 1000 * budget, 1.05 * float(np.quantile(bottom, 0.99))))
+    axes.set_xlabel("keyframe")
+    axes.set_ylabel("ms")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, reverse=True)
+    return chart_png(figure)

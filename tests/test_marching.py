@@ -1,0 +1,175 @@
+"""Marching cubes by blocks: the surface of the whole volume, renewed only where it changed."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from colons import colon, slam, truth
+
+from densify.fusion import FusionConfig, TsdfVolume
+from densify.marching import _ABOVE, BlockSurface, _table, joined, packed, touched_cells, unpacked
+from densify.rectify import RectifyConfig, surface_view
+from lightdepth.camera import Pinhole
+from lightdepth.prediction import DepthPrediction
+
+
+def codes(blocks) -> np.ndarray:
+    return packed(np.array(sorted(blocks), int).reshape(-1, 3))
+
+
+def whole(volume: TsdfVolume) -> BlockSurface:
+    surface = BlockSurface()
+    surface.renew(volume, codes(volume.blocks))
+    return surface
+
+
+def plane(z: float = 20.0, color: float = 0.5, first: int = 0):
+    """A view of the plane at depth z; columns before `first` see nothing."""
+    camera = Pinhole(120, 90, 100.0, 100.0, 60.0, 45.0)
+    valid = np.ones((90, 120), bool)
+    valid[:, :first] = False
+    distance = (z / camera.rays()[0][..., 2]).astype(np.float32)
+    prediction = DepthPrediction("0", distance, valid, camera, "plane")
+    return surface_view(prediction, np.full((90, 120, 3), color, np.float32), RectifyConfig())
+
+
+@cache
+def views():
+    """Views of four keyframes of a colon, their poses, and a voxel size."""
+    frames = colon(0).frames[:4]
+    found = slam(frames)
+    scale = found.map_from_world[0][0]
+    (submap,) = found.map.submaps
+    made = [surface_view(truth(f).scaled(scale), f.image, RectifyConfig(), 40 * scale) for f in frames]
+    return [(view, k.cam_from_map) for view, k in zip(made, submap.keyframes, strict=True)], 0.9 * scale
+
+
+@pytest.fixture(scope="module")
+def fused() -> TsdfVolume:
+    volume = TsdfVolume(views()[1], FusionConfig())
+    for view, pose in views()[0]:
+        volume.integrate(view, pose)
+    return volume
+
+
+def test_patches_joined_are_the_mesh_of_the_whole_volume(fused):
+    vertices, triangles, colors = joined(whole(fused).patches.values())
+    mesh = fused.extract_mesh()
+    assert len(vertices) == len(mesh.vertices) > 1500 and len(triangles) == len(mesh.triangles)
+    order, other = (np.lexsort(v.round(4).T) for v in (vertices / fused.voxel, mesh.vertices / fused.voxel))
+    np.testing.assert_allclose(vertices[order], mesh.vertices[other], atol=1e-3 * fused.voxel)
+    assert np.abs(colors[order] - mesh.colors[other]).max() < 1.01 / 255
+    areas = []
+    for points, faces in ((vertices, triangles), (mesh.vertices, mesh.triangles)):
+        a, b, c = (points[faces[:, i]] for i in range(3))
+        areas.append(np.cross(b - a, c - a).sum(0))
+    np.testing.assert_allclose(*areas, rtol=1e-2)  # turned to the same side
+
+
+def test_no_edge_has_more_than_two_triangles_and_both_turn_alike(fused):
+    _, triangles, _ = joined(whole(fused).patches.values())
+    edges = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+    assert len(np.unique(edges, axis=0)) == len(edges)
+    assert np.unique(np.sort(edges, 1), axis=0, return_counts=True)[1].max() == 2
+
+
+class Noise:
+    """A volume of 2 x 2 x 2 blocks of noise, which holds every case and every meeting of two; before the surface at its
+    border."""
+
+    voxel, capacity = 1.0, 8
+
+    def __init__(self, rng: np.random.Generator):
+        whole = np.ones((16, 16, 16), np.float32)
+        whole[1:15, 1:15, 1:15] = rng.uniform(-1, 1, (14, 14, 14))
+        self.behind = whole < 0
+        self._t = whole.reshape(2, 8, 2, 8, 2, 8).transpose(0, 2, 4, 1, 3, 5).reshape(8, 8, 8, 8)
+        self.keys = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+
+    def slots(self, places: np.ndarray) -> np.ndarray:
+        return np.where(((places >= 0) & (places <= 1)).all(1), places @ (4, 2, 1), -1)
+
+    def sides(self, slots: np.ndarray) -> np.ndarray:
+        return np.full(len(slots), 3, np.uint8)
+
+    def values(self, slots: np.ndarray) -> np.ndarray:
+        return self._t[slots]
+
+    def color_sums(self, voxels: np.ndarray) -> np.ndarray:
+        return np.ones((len(voxels), 4))
+
+
+def test_any_signs_whatever_give_a_closed_surface():
+    volume = Noise(np.random.default_rng(1))
+    surface = BlockSurface()
+    surface.renew(volume, packed(volume.keys))
+    vertices, triangles, _ = joined(surface.patches.values())
+    case = sum(
+        volume.behind[x : x + 15, y : y + 15, z : z + 15].astype(int) << bit
+        for bit, (x, y, z) in enumerate(_ABOVE.tolist())
+    )
+    assert len(np.unique(case)) == 256 and len(vertices) > 2000 and _table()[1].max() == 5
+    edges = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+    there, times = np.unique(edges, axis=0, return_counts=True)
+    back, back_times = np.unique(edges[:, ::-1], axis=0, return_counts=True)
+    assert np.array_equal(there, back) and np.array_equal(times, back_times)
+
+
+def test_a_vertex_is_where_the_distance_is_zero_in_the_colour_between():
+    volume = TsdfVolume(0.4, FusionConfig())
+    volume.integrate(plane(20.1, color=0.25), np.eye(4))
+    vertices, triangles, colors = joined(whole(volume).patches.values())
+    assert np.abs(vertices[:, 2] - 20.1).max() < 2e-3
+    assert np.abs(colors - 0.25).max() < 1.01 / 255
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    assert (np.cross(b - a, c - a)[:, 2] < 0).mean() > 0.999  # they face the camera
+
+
+def test_where_too_few_have_looked_there_is_no_surface():
+    volume = TsdfVolume(0.4, FusionConfig(min_views=2))
+    volume.integrate(plane(), np.eye(4))
+    assert not whole(volume).patches
+    volume.integrate(plane(first=60), np.eye(4))
+    vertices, _, _ = joined(whole(volume).patches.values())
+    assert len(vertices) > 300 and vertices[:, 0].min() > -0.5
+
+
+def test_keys_are_packed_and_unpacked_below_zero_too():
+    keys = np.array([[0, 0, 0], [-1, 5, -70000], [500000, -500000, 3]])
+    assert np.array_equal(unpacked(packed(keys)), keys)
+    assert len(touched_cells(packed(keys))) == 24
+    assert set(map(tuple, unpacked(touched_cells(packed(keys[:1]))).tolist())) == {
+        (x, y, z) for x in (0, -1) for y in (0, -1) for z in (0, -1)
+    }
+
+
+def equal(one: BlockSurface, other: BlockSurface) -> bool:
+    return one.patches.keys() == other.patches.keys() and all(
+        np.array_equal(getattr(one.patches[k], name), getattr(other.patches[k], name))
+        for k in one.patches
+        for name in ("vertices", "triangles", "colors", "edges")
+    )
+
+
+def test_a_surface_renewed_view_by_view_is_the_one_made_at_once():
+    volume, surface = TsdfVolume(views()[1], FusionConfig()), BlockSurface()
+    for view, pose in views()[0]:
+        surface.renew(volume, codes(volume.integrate(view, pose)))
+        assert equal(surface, whole(volume))
+    for view, pose in views()[0]:
+        surface.renew(volume, codes(volume.remove(view, pose)))
+        assert equal(surface, whole(volume))
+    assert not surface.patches and not volume.blocks
+
+
+def test_only_blocks_beside_a_change_are_made_again():
+    volume, surface = TsdfVolume(0.4, FusionConfig()), BlockSurface()
+    surface.renew(volume, codes(volume.integrate(plane(), np.eye(4))))
+    before = dict(surface.patches)
+    changed = codes(volume.integrate(plane(first=105), np.eye(4)))
+    surface.renew(volume, changed)
+    touched = {code for code in before if before[code] is not surface.patches.get(code)}
+    assert touched and touched <= set(touched_cells(changed).tolist()) == set(surface.renewed.tolist())
+    assert len(touched) < 0.5 * len(before)
