@@ -5,8 +5,8 @@ negative behind the surface. A cell is the cube between eight voxels and belongs
 block's cells need the first voxels of the seven blocks above it. A vertex lies on an edge between two voxels, and is
 the same on whichever side of a block's border it is computed. Arrays of voxels have axes x, y, z.
 
-Marching cubes after Lorensen and Cline 1987. The 256 cases are derived, not listed: on every face of a cell the corners
-behind the surface are cut off singly, so that neighbouring cells always agree and the surface has no cracks.
+The cases are those of densify.marching_cubes, which makes a whole surface at once. Here each block is cut by itself,
+with the first voxels of the blocks above it, so that no patch needs another.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-SIDE = 8
+from densify.fusion import BLOCK as SIDE
+from densify.marching_cubes import CORNERS, EDGES, triangle_table
+
 _VOXELS = (SIDE + 1) ** 3  # of a block and its border
 _EDGES = 3 * _VOXELS  # axis, then x, y, z of the lower voxel
-_ABOVE = np.array([(c & 1, c >> 1 & 1, c >> 2) for c in range(8)])  # the corners of a cell, as x, y, z
 _CHUNK = 1024  # blocks that are worked on at once: some 50 MB
 _BITS = 20  # of each of the three numbers in a packed key: half a million voxels to either side of the map's origin
 
@@ -60,7 +61,7 @@ def packed(keys: np.ndarray) -> np.ndarray:
     return x << 2 * _BITS | y << _BITS | z
 
 
-_STEPS = packed(_ABOVE) - packed(np.zeros((1, 3), int))  # to the eight corners, in packed keys
+_STEPS = packed(CORNERS) - packed(np.zeros((1, 3), int))  # to the eight corners, in packed keys
 
 
 def unpacked(codes: np.ndarray) -> np.ndarray:
@@ -109,7 +110,7 @@ def _with_border(volume: Blocks, slots: np.ndarray) -> np.ndarray:
     out = np.full((len(slots), SIDE + 1, SIDE + 1, SIDE + 1), np.nan, np.float32)
     needed = np.unique(slots[slots >= 0])
     values, row = volume.values(needed), np.searchsorted(needed, slots)
-    for above, rows, held in zip(_ABOVE, row.T, slots.T >= 0, strict=True):
+    for above, rows, held in zip(CORNERS, row.T, slots.T >= 0, strict=True):
         to = tuple(slice(SIDE, None) if up else slice(0, SIDE) for up in above)
         take = tuple(slice(0, 1) if up else slice(None) for up in above)
         out[(held, *to)] = values[(rows[held], *take)]
@@ -121,7 +122,7 @@ def _cells(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # Flat, so that a corner is a shift and every pass runs through memory in one go; a block's border is no cell's
     # lowest corner, and so what a shift brings in from the next block is never looked at.
     behind, known = (t < 0).ravel().view(np.uint8), ~np.isnan(t).ravel()
-    places = _place(*_ABOVE.T)
+    places = _place(*CORNERS.T)
     inside = np.zeros((SIDE + 1,) * 3, bool)
     inside[:SIDE, :SIDE, :SIDE] = True
     size = behind.size - int(places[-1])
@@ -165,52 +166,13 @@ def _voxel_at(slots: np.ndarray, block: np.ndarray, voxel: np.ndarray) -> np.nda
     return ((slot * SIDE + x) * SIDE + y) * SIDE + z
 
 
-_FACES = (  # corners of each face of a cell, anticlockwise as seen from outside; corner 1 is +x, 2 is +y, 4 is +z
-    (0, 2, 3, 1),
-    (4, 5, 7, 6),
-    (0, 1, 5, 4),
-    (2, 6, 7, 3),
-    (0, 4, 6, 2),
-    (1, 3, 7, 5),
-)
-
-
 @cache
 def _table() -> tuple[np.ndarray, np.ndarray]:
-    """For each case, the edges of its triangles (256, k, 3) as offsets from the cell's place, and how many there are.
-
-    Triangles turn anticlockwise as seen from in front of the surface.
-    """
-    cases = [_triangles(case) for case in range(256)]
-    count = np.array([len(found) for found in cases], np.int32)
-    offsets = np.zeros((256, int(count.max()), 3), np.int32)
-    for case, found in enumerate(cases):
-        offsets[case, : len(found)] = np.array(found, np.int32).reshape(-1, 3)
-    return offsets, count
-
-
-def _triangles(case: int) -> list[tuple[int, int, int]]:
-    following: dict[int, int] = {}
-    for face in _FACES:
-        inside = [case >> corner & 1 for corner in face]
-        for i in range(4):
-            if inside[i] and not inside[i - 1]:  # a run of corners behind the surface starts here
-                end = next(j for j in range(i + 1, i + 5) if not inside[j % 4])
-                enter, leave = _edge(face[i - 1], face[i]), _edge(face[(end - 1) % 4], face[end % 4])
-                following[enter] = leave
-    triangles = []
-    while following:
-        loop = [next(iter(following))]
-        while (edge := following.pop(loop[-1])) != loop[0]:
-            loop.append(edge)
-        triangles += [(loop[0], a, b) for a, b in zip(loop[1:], loop[2:], strict=False)]
-    return triangles
-
-
-def _edge(corner: int, other: int) -> int:
-    """Offset of the edge between two corners of a cell from the cell's place among the edges."""
-    axis = (corner ^ other).bit_length() - 1
-    return int(axis * _VOXELS + _place(*_ABOVE[min(corner, other)]))
+    """For each case, the edges of its triangles (256, 5, 3) as offsets from the cell's place among the edges, and how
+    many triangles there are (256,)."""
+    table, counts = triangle_table()
+    corner, _, axis = EDGES.T
+    return (axis * _VOXELS + _place(*CORNERS[corner].T)).astype(np.int32)[table], counts.astype(np.int32)
 
 
 class BlockSurface:
