@@ -13,6 +13,7 @@ from colons import colon, sequence, slam
 from test_live import setting
 
 from densify.cli import live
+from densify.fusion import FusionConfig
 from densify.live import STEPS, StepTime
 from densify.pipeline import DensifyConfig
 from densify.play import Played, play, time_spent, timings_picture, write_timings
@@ -23,6 +24,7 @@ from lightdepth.frame import Frame
 from lightdepth.predict import DeclineModel
 
 DECLINE = DeclineModel(details=False)
+COARSE = DensifyConfig(withhold=0.0, fusion=FusionConfig(voxels_per_distance=15.0))
 
 
 def one(wall_ms: dict[str, float], **changes) -> Played:
@@ -32,10 +34,10 @@ def one(wall_ms: dict[str, float], **changes) -> Played:
 
 
 def test_maps_and_keyframes_come_in_the_order_of_the_recording():
-    frames, found, config = setting(maps=2, count=6)
+    frames, found, _ = setting(maps=2, count=6)
     backward = replace(found.map, submaps=found.map.submaps[::-1])
     surfaces = []
-    played = play(sequence(frames), backward, DECLINE, config, surfaces.append)
+    played = play(sequence(frames), backward, DECLINE, COARSE, surfaces.append)
     assert [p.map for p in played] == [0] * 3 + [1] * 5
     assert [d.submap.id for d in surfaces] == [0, 1] and all(len(d.triangles) for d in surfaces)
     assert all(set(p.times) == {"read", *STEPS} for p in played)
@@ -105,7 +107,8 @@ def data(tmp_path_factory):
 
 def test_the_verb_writes_surfaces_timings_and_what_they_say(data, tmp_path, capsys):
     run = tmp_path / "run"
-    live(data, run, map=data / "slam", checkpoint="decline", fit_light=False, budget_ms=1e6)
+    coarse = FusionConfig(voxels_per_distance=15.0)
+    live(data, run, map=data / "slam", checkpoint="decline", fit_light=False, budget_ms=1e6, fusion=coarse)
     names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
     assert {
         "timings.csv",
@@ -163,9 +166,7 @@ def test_a_screening_in_small_ends_with_a_surface_for_every_submap_and_memory_fo
     few = [replace(k, pixels=k.pixels[:5], point_ids=k.point_ids[:5]) for k in poor.keyframes]
     submaps = (found.map.submaps[0], replace(poor, keyframes=tuple(few)), found.map.submaps[2])
     surfaces = []
-    played = play(
-        sequence(frames), replace(found.map, submaps=submaps), DECLINE, DensifyConfig(withhold=0.0), surfaces.append
-    )
+    played = play(sequence(frames), replace(found.map, submaps=submaps), DECLINE, COARSE, surfaces.append)
     assert len(played) == 9 and [len(d.triangles) > 0 for d in surfaces] == [True, False, True]
     assert all("at least 8" in p.reason for p in played[3:6])
     unpacked = frames[0].image.nbytes + frames[0].true_distance.nbytes
