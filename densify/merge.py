@@ -30,13 +30,13 @@ from scipy.spatial.transform import Rotation
 
 from densify.dense_map import DenseMap
 from densify.evaluation import Similarity
-from densify.pipeline import DensifyConfig, KeyframeView, Model, SubmapResult, densify_submap, typical_distance
+from densify.pipeline import DensifyConfig, KeyframeView, Model, SubmapResult, densify, typical_distance
 from densify.similarity import robust_similarity
 from lightdepth import native
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
-from lightdepth.sparse_map import Keyframe, Submap
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Meeting:
                 (own,) = group
                 tried = [j for j in self.refused if own in (j.target, j.source)]
                 texts = [f"map {j.source if j.target == own else j.target} by {j.by}: {j.reason}" for j in tried]
-                reasons[own] = "; ".join(texts) or "there is no other map"
+                reasons[own] = "; ".join(texts) or "it has nothing that could be compared with another map"
         return reasons
 
 
@@ -140,7 +140,11 @@ def join_maps(
             if tried > config.max_pairs:
                 refused.append(Join(target, source, by, reason=f"not compared, beyond max_pairs {config.max_pairs}"))
                 continue
-            join = _FINDERS[by](sides[target], sides[source], rng)
+            join: Join | None
+            try:
+                join = _FINDERS[by](sides[target], sides[source], rng)
+            except InputError as error:  # a map without observations, say: the others go on
+                join = Join(target, source, by, reason=str(error))
             if join is None:
                 continue
             if not join.ok:
@@ -212,8 +216,11 @@ def merge(
     by_id = {r.dense.submap.id: r.dense.submap for r in results}
     meeting = join_maps([r.dense for r in results], frames, config, rng)
     groups = [g for g in meeting.groups if len(g) > 1]
-    submaps = [joined_submap([by_id[i] for i in g], g, k, config) for k, g in enumerate(groups)]
-    return Merged(meeting, tuple(densify_submap(s, frames, model, recipe, on_keyframe) for s in submaps))
+    submaps = tuple(joined_submap([by_id[i] for i in g], g, k, config) for k, g in enumerate(groups))
+    if not submaps:
+        return Merged(meeting, ())
+    joined = densify(frames, SparseMap(submaps, "joined maps"), model, recipe, on_keyframe)
+    return Merged(meeting, tuple(joined))
 
 
 def joined_submap(
