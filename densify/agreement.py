@@ -152,8 +152,8 @@ def _unbent(view: View, bending: BendingConfig) -> Bend:
 
 @dataclass(frozen=True)
 class _Places:
-    """What no round changes: the basis at the points (n, m), and of a grid of pixels the unit rays (g, 3), log
-    predicted distance (g,) and basis (g, m)."""
+    """What no round changes: the basis at the points (n, m), and of a grid of pixels the unit rays (g, 3), the log
+    predicted distance (g,) and the basis (g, m)."""
 
     at_points: np.ndarray
     rays: np.ndarray

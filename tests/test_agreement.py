@@ -1,4 +1,4 @@
-"""Keyframes that agree: smooth errors found from points and overlap, and what contradicts a nearer view known."""
+"""Keyframes that agree: smooth errors are found from points and overlap; nearer views contradict farther ones."""
 
 from __future__ import annotations
 
