@@ -37,8 +37,8 @@ def undistorted(
     pixels, seen = prediction.camera.project(rays.reshape(-1, 3))
     x, y = (pixels.reshape(*rays.shape[:2], 2) - 0.5).astype(np.float32).transpose(2, 0, 1)  # cv2 counts from centres
     known = cv2.remap(prediction.valid.astype(np.float32), x, y, cv2.INTER_LINEAR, borderValue=0)
-    distance = np.where(prediction.valid, prediction.distance, 0).astype(np.float32)
-    distance = cv2.remap(distance, x, y, cv2.INTER_LINEAR)
+    given = np.where(prediction.valid, prediction.distance, 0).astype(np.float32)
+    distance = cv2.remap(given, x, y, cv2.INTER_LINEAR)
     color = cv2.remap(np.ascontiguousarray(image, np.float32), x, y, cv2.INTER_LINEAR)
     use = seen.reshape(known.shape) & (known > 0.999) & (distance > 0) & (distance <= max_distance)
     return np.where(use, distance * rays[..., 2], 0).astype(np.float32), color, pinhole
