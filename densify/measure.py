@@ -79,8 +79,8 @@ def _unfolded(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tup
 
 @dataclass(frozen=True)
 class Way:
-    """A path along the wall: points (n, 3) on it, its length, that of the line between its ends, and the length
-    of those parts of it that cross a hole."""
+    """A path along the wall: points (n, 3), its length, that of the straight line between its ends, and the length of
+    those parts of it that cross a hole."""
 
     points: np.ndarray
     length: float

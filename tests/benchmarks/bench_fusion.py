@@ -1,13 +1,14 @@
 """Our fusion against Open3D's VoxelBlockGrid fed through cube faces: field, accuracy, time as a ratio in the same run.
 
 Run by `make bench`, or `pytest tests/benchmarks/bench_fusion.py -o python_files='bench_*.py' -o addopts= -s`. The
-reference has no weights and takes pinhole depth, so a lens is resampled into the faces of a cube that its field touches.
+reference has no weights and takes pinhole depth: a lens is resampled into the faces of a cube that its field touches.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import cv2
 import numpy as np
@@ -129,6 +130,10 @@ def errors(name: str, vertices: np.ndarray) -> np.ndarray:
     return np.abs(radius - (10 if name == "sphere" else 8)) / VOXEL
 
 
+def step(view: Callable, volume: TsdfVolume, prediction: DepthPrediction, image: np.ndarray) -> None:
+    volume.integrate(view(prediction, image, RectifyConfig(), FAR), np.eye(4))
+
+
 def test_exact_depth_field_accuracy_and_time():
     torch.set_num_threads(1)
     print("\nexact depth, 320x256, one view         error [voxel]           largest    time of view + integration, of")
@@ -138,13 +143,11 @@ def test_exact_depth_field_accuracy_and_time():
         for name, make in SCENES.items():
             scene = make(camera)
             prediction, image = scene.prediction(), scene.frame().image
-            config, volumes, steps = RectifyConfig(), {}, {}
+            volumes, steps = {}, {}
             for way, (view, volume) in WAYS.items():
                 volumes[way] = volume(VOXEL, FusionConfig())
-                volumes[way].integrate(view(prediction, image, config, FAR), np.eye(4))
-                steps[way] = lambda view=view, target=volume(VOXEL, FusionConfig()): target.integrate(
-                    view(prediction, image, config, FAR), np.eye(4)
-                )
+                step(view, volumes[way], prediction, image)
+                steps[way] = partial(step, view, volume(VOXEL, FusionConfig()), prediction, image)
             times, extract = best(steps), best({way: v.extract_mesh for way, v in volumes.items()})
             for way, volume in volumes.items():
                 mesh = volume.extract_mesh()
@@ -165,7 +168,8 @@ def test_exact_depth_field_accuracy_and_time():
         rays, kept = camera.rays()[0].reshape(-1, 3), cropped.weights[:-1] > 0
         widest = np.degrees(np.arccos(rays[kept][:, 2].min()))
         print(
-            f"{lens_name:8} a pinhole of the same size would hold {kept.sum() / camera.rays()[1].sum():.1%}, to {widest:.1f} degrees"
+            f"{lens_name:8} a pinhole of the same size would hold {kept.sum() / camera.rays()[1].sum():.1%}, "
+            f"to {widest:.1f} degrees"
         )
 
 
