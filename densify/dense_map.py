@@ -71,13 +71,6 @@ class Contribution:
     confidence: float = np.nan
     views: float = np.nan
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance (n,) from points (n, 3) to the closest of the surface, in single precision; infinite without any."""
-        if self._scene is None or not len(points):
-            return np.full(len(points), np.inf)
-        found = self._scene.compute_distance(self._core.Tensor(points.astype(np.float32)))
-        return found.numpy().astype(np.float64)
-
 
 @dataclass(frozen=True)
 class DenseMap:
