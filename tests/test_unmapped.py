@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from densify.retrieval import frame_pairs, vlad
-from densify.unmapped import Matching, counted, reasons
+from densify.unmapped import Matching, reasons, summary
 from lightdepth.importing.measures import Measures
 
 USUAL = {"brightness": 120.0, "saturated": 0.02, "sharpness": 0.1}
@@ -46,7 +46,7 @@ def test_a_good_image_fails_for_its_features_its_matches_its_parallax_or_the_agr
 def test_where_no_frame_is_mapped_the_sharpest_tell_the_blurred_ones():
     found = judged(10, [], sharpness=dict.fromkeys(range(3), 0.02))
     assert all("blurred" in r for r in found[:3]) and all("no matches" in r for r in found[3:])
-    assert counted(found) == "7 no matches, 3 blurred"
+    assert summary(found) == "7 no matches, 3 blurred"
 
 
 def sights(count: int, places: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
