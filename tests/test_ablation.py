@@ -264,6 +264,19 @@ def test_the_reflectance_that_a_network_is_told_is_a_wrong_one_or_the_one_of_lea
     assert found["true"] == found["estimated"] == pytest.approx(0, abs=1e-6) and found["wrong"] > 0.1
 
 
+def test_far_depth_and_the_rim_of_a_wide_lens_are_not_judged():
+    colon = colon_of(0.0)
+    right, z = colon.true_distance.clamp(min=1), colon.rays[:, 2:3].clone()
+    z[..., :3], far = 0.1, torch.zeros_like(colon.mask)
+    far[..., -4:] = True
+    rays = torch.cat([colon.rays[:, :2], z], 1)
+    seen = colon._replace(rays=rays, true_distance=torch.where(far, 300.0, right))
+    wrong = torch.where(far | (z < 0.15), 7 * right, right)
+    assert ablation._errors([wrong], [seen])["rmse_mm"] == pytest.approx(0, abs=1e-4)
+    inside = torch.where(torch.arange(40) == 20, 7 * right, right)
+    assert ablation._errors([inside], [seen])["rmse_mm"] > 1
+
+
 def test_reflectance_goes_into_the_network_that_asks_for_it_and_into_no_other():
     torch.manual_seed(0)
     batch = colon_of(0.1)
