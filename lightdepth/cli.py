@@ -32,6 +32,7 @@ ORDER = (
     "densify",
     "live",
     "evaluate",
+    "measure",
 )
 FILES = ("calibrate-light", "convert-camera", "select")
 """Verbs that write a file; the others make a folder."""

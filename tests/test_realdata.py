@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from densify.agreement import AgreementConfig
 from densify.evaluation import evaluate_depth
 from densify.judge import judge_gap, read_run
 from densify.pipeline import DensifyConfig, SubmapResult, densify, fitted_to_frames
@@ -47,7 +48,8 @@ def dense_and_constant(realdata: Path) -> tuple[SubmapResult, SubmapResult]:
     frames = read_once(realdata / "sinus" / SINUS, map_folder)
     fitted = fitted_to_frames(read_map(map_folder), *frames.image_size())
     models = DeclineModel(details=False), ConstantModel()
-    right, constant = (densify(frames, fitted, model, DensifyConfig())[0] for model in models)
+    rigid = DensifyConfig(agreement=AgreementConfig(on=False))  # bent to the map, a constant would be the map's merit
+    right, constant = (densify(frames, fitted, model, rigid)[0] for model in models)
     print(
         f"{len(right.dense.aligned)} of {len(right.dense.alignments)} aligned, seen {right.seen_share:.3f}, withheld "
         f"{right.withheld.median:.4f}, constant {constant.withheld.median:.4f} ({constant.withheld.median_met:.4f} met)"

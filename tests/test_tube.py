@@ -167,7 +167,7 @@ def test_lenses_are_known_by_name_and_others_refused():
     assert isinstance(wide, KannalaBrandt)
     edge, valid = wide.unproject(np.array([0.0, 56.0]))
     assert valid and np.degrees(np.arccos(edge[2])) == pytest.approx(68, abs=0.5)
-    with pytest.raises(InputError, match="lens 'rear'; expected pinhole, fisheye or c3vd"):
+    with pytest.raises(InputError, match="lens 'rear'; expected pinhole, telescope, fisheye or c3vd"):
         lens("rear", 64, 48)
 
 
