@@ -34,7 +34,7 @@ ORDER = (
     "evaluate",
     "measure",
 )
-FILES = ("calibrate-light", "convert-camera", "select")
+FILES = ("calibrate-light", "convert-camera", "select", "measure")
 """Verbs that write a file; the others make a folder."""
 
 
