@@ -61,7 +61,10 @@ class MergeConfig:
     max_shape_gap: float = 0.05  # the same after joining by shape, which leaves less
     max_through: float = 0.15  # share of rays to one surface in whose way the other stands
     min_overlap: float = 0.3  # share of the rays of a camera that must meet both surfaces
-    min_likeness: float = 0.1  # correlation of fine colours after joining by shape; chance gives 0.06 at most
+    min_shape_share: float = 0.15  # of the features that must agree after joining by shape; chance gives 5 % at most
+    min_likeness: float = (
+        0.1  # or else the correlation of the finer colours; chance gives 0.06 at most, 2 degrees off no more
+    )
 
     def __post_init__(self) -> None:
         unknown = set(self.by) - set(_FINDERS)
@@ -618,8 +621,11 @@ def _by_surface(target: _Side, source: _Side, rng: np.random.Generator) -> Join 
         join = replace(join, target_from_source=unit @ similarity @ own_unit)
         join = _checked(join, target, source, config.max_shape_gap)
         likeness = _correlation(to.tone[met_to], own.tone[met_own])
-        if join.ok and likeness < config.min_likeness:
-            reason = f"the colours have a correlation of {likeness:.2f}; at least {config.min_likeness}"
+        if join.ok and likeness < config.min_likeness and join.agreeing < config.min_shape_share * join.matches:
+            reason = (
+                f"{join.agreeing} of {join.matches} features agree, at least {config.min_shape_share:.0%}; nor do the"
+            )
+            reason += f" colours, with a correlation of {likeness:.2f}, at least {config.min_likeness}"
             join = replace(join, reason=reason)
         if join.ok:
             break
