@@ -62,9 +62,8 @@ class MergeConfig:
     max_through: float = 0.15  # share of rays to one surface in whose way the other stands
     min_overlap: float = 0.3  # share of the rays of a camera that must meet both surfaces
     min_shape_share: float = 0.15  # of the features that must agree after joining by shape; chance gives 5 % at most
-    min_likeness: float = (
-        0.1  # or else the correlation of the finer colours; chance gives 0.06 at most, 2 degrees off no more
-    )
+    # Or else the correlation of the finer colours; chance gives 0.06 at most, 2 degrees off no more.
+    min_likeness: float = 0.1
 
     def __post_init__(self) -> None:
         unknown = set(self.by) - set(_FINDERS)
