@@ -38,12 +38,17 @@ from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
+_CHANCE = 4.5
+"""Standard deviations of the correlation of unrelated points, 1 / sqrt(n), that a likeness must exceed: many poses are
+tried, and the best of them is looked at."""
+
 
 @dataclass(frozen=True)
 class MergeConfig:
     """When two submaps are one. Lengths on the surface are shares of the reach."""
 
-    by: tuple[str, ...] = ("points", "frames", "looks", "surface")  # what to join by, in this order
+    # What to join by, in this order. "surface", by shape alone, is there to be asked for: chance can join what is apart.
+    by: tuple[str, ...] = ("points", "frames", "looks")
     min_agreeing: int = 12  # correspondences
     min_share: float = 0.2  # of the correspondences of points and frames; 30 % wrong points in both maps leave 40 %
     min_alike_share: float = 0.1  # of the points that look alike, most of which only do so
@@ -620,11 +625,12 @@ def _by_surface(target: _Side, source: _Side, rng: np.random.Generator) -> Join 
         join = replace(join, target_from_source=unit @ similarity @ own_unit)
         join = _checked(join, target, source, config.max_shape_gap)
         likeness = _correlation(to.tone[met_to], own.tone[met_own])
-        if join.ok and likeness < config.min_likeness and join.agreeing < config.min_shape_share * join.matches:
+        least = max(config.min_likeness, _CHANCE / np.sqrt(len(met_to)))
+        if join.ok and likeness < least and join.agreeing < config.min_shape_share * join.matches:
             reason = (
                 f"{join.agreeing} of {join.matches} features agree, at least {config.min_shape_share:.0%}; nor do the"
             )
-            reason += f" colours, with a correlation of {likeness:.2f}, at least {config.min_likeness}"
+            reason += f" colours, with a correlation of {likeness:.2f}, at least {least:.2f}"
             join = replace(join, reason=reason)
         if join.ok:
             break
