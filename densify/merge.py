@@ -47,7 +47,7 @@ tried, and the best of them is looked at."""
 class MergeConfig:
     """When two submaps are one. Lengths on the surface are shares of the reach."""
 
-    # What to join by, in this order. "surface", by shape alone, is there to be asked for: chance can join what is apart.
+    # What to join by, in this order. "surface", by shape alone, has to be asked for: chance can join what is apart.
     by: tuple[str, ...] = ("points", "frames", "looks")
     min_agreeing: int = 12  # correspondences
     min_share: float = 0.2  # of the correspondences of points and frames; 30 % wrong points in both maps leave 40 %
