@@ -304,7 +304,7 @@ def test_two_overlapping_halves_of_the_sinus_are_joined(realdata, seed):
     assert scale < 0.02 and degrees < 1 and by == "points"
 
 
-@pytest.mark.parametrize("by", ["looks", "surface"])
+@pytest.mark.parametrize("by", ["looks", pytest.param("surface", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("seed", [400, pytest.param(401, marks=pytest.mark.slow)])
 def test_two_halves_of_the_sinus_without_a_common_frame_are_joined_by_the_surface_that_both_see(realdata, seed, by):
     """By the points on it that look alike, which is tried first, and by its shape alone."""

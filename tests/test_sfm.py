@@ -199,6 +199,7 @@ def test_a_png_can_be_written_after_pycolmap_was_loaded(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_long_sequences_are_matched_by_looks_too_and_give_the_same_map_twice(tmp_path):
     config = SfmConfig(matching="sequential", overlap=2, alike=1, max_features=800)
     frames = film(PINHOLE, 6)

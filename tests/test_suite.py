@@ -70,6 +70,7 @@ def rows_of(text: str, title: str) -> dict[tuple[str, ...], list[str]]:
     return {tuple(row[:words]): row[words:] for row in cells}
 
 
+@pytest.mark.slow
 def test_one_command_makes_the_maps_dense_and_lays_the_paper_s_rows_beside_ours(trees, tmp_path):
     data, maps = trees
     with pytest.raises(PartialFailure, match=r"9 part\(s\) failed, the first: t3a: trans_t3_a is not in"):
