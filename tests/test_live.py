@@ -234,7 +234,7 @@ def test_what_is_kept_of_a_keyframe_is_small_and_comes_back():
     valid = prediction.valid
     assert np.array_equal(again.valid, valid) and again.albedo is None and again.normals is None
     assert np.abs(again.distance / prediction.distance - 1)[valid].max() < 1e-4
-    assert np.abs(again.uncertainty / sigma - 1)[valid].max() < 1e-4
+    assert np.abs(again.uncertainty / sigma - 1)[valid].max() < 0.01
     assert np.abs(view.image() - frame.image).mean() < 0.02
     view, _ = packed_view(prediction, frame.image)
     assert view.size < 0.15 * (prediction.distance.nbytes + frame.image.nbytes)
