@@ -95,7 +95,7 @@ def test_a_run_leaves_a_table_with_every_row_and_every_number_behind_it(finished
     text = (finished / "docs" / "ablation.md").read_text()
     assert text == (finished / "run" / "ablation.md").read_text()
     assert "| ours |" in text and "| no smoothness | weight 0 |" in text and "not to be edited" in text
-    assert "30000" in text and "of another make: 5, 2 frames each" in text  # what was trained and judged on
+    assert "30000" in text and "of another make: seeds 5, 2 frames each" in text  # what was trained and judged on
     with (finished / "run" / "ablation.csv").open() as file:
         numbers = list(csv.DictReader(file))
     assert len(numbers) == len(ROWS) * len(METRICS)
@@ -216,15 +216,29 @@ def table_of(**ratios: tuple[float, ...]) -> Table:
 
 
 def test_a_difference_is_clear_where_its_mean_is_larger_than_its_spread_over_the_seeds():
-    table = table_of(
-        base=(0.8, 0.9, 1.0), worse=(0.9, 1.0, 1.11), better=(0.7, 0.8, 0.9), same=(0.9, 0.9, 1.0), once=(1.5,)
-    )
+    ratios = {
+        "base": (0.8, 0.9, 1.0),
+        "worse": (0.9, 1.0, 1.11),
+        "better": (0.7, 0.8, 0.9),
+        "perhaps": (0.81, 1.0, 1.2),
+        "same": (0.9, 0.9, 1.0),
+        "once": (1.5,),
+    }
+    table = table_of(**ratios)
     verdicts = {line.name: line.verdict() for line in lines(table)[1:]}
-    assert verdicts == {"worse": "worse", "better": "better", "same": "no clear difference", "once": "one seed"}
+    assert verdicts == {
+        "worse": "worse",
+        "better": "better",
+        "perhaps": "worse in every seed",
+        "same": "no clear difference",
+        "once": "one seed",
+    }
     text = markdown(table)
     assert "| worse |  | 1.003 (.900-1.110) | **+.103** | worse |" in text
-    assert "these earn their place: worse (+.103)." in text
-    assert "no clear difference: same (+.033)." in text and "clearly better without: better (-.100)." in text
+    assert "earns its place, all are clearly worse: worse (+.103).\n" in text
+    assert "do not agree on a difference: same (+.033).\n" in text
+    assert "all are worse in every seed, but by less than the seeds differ: perhaps (+.103).\n" in text
+    assert "did harm here, all are clearly better: better (-.100).\n" in text and "one seed: once (+.700)." in text
     assert not clear(np.array([0.5]))
 
 

@@ -30,6 +30,26 @@ if TYPE_CHECKING:
 METRICS = {"abs_rel": "AbsRel", "rmse_mm": "RMSE", "medae_mm": "MedAE"}
 _TOLD = {"true": "the true one", "wrong": "one .3 too high", "estimated": "one estimated per colon, without truth"}
 _SHOWN_POINTS = 6
+_IN_EVERY_SEED = "in every seed, but by less than the seeds differ"
+_HEADINGS = {
+    "dropped": {
+        "worse": "What these rows leave out earns its place, all are clearly worse",
+        "worse in every seed": f"What these leave out may help, all are worse {_IN_EVERY_SEED}",
+        "no clear difference": "What these leave out did not help, the seeds do not agree on a difference",
+        "better in every seed": f"What these leave out may harm, all are better {_IN_EVERY_SEED}",
+        "better": "What these leave out did harm here, all are clearly better",
+        "one seed": "Left out with one seed",
+    },
+    "instead": {
+        "better": "Instead of what the first row has, clearly better",
+        "better in every seed": f"Instead of what the first row has, better {_IN_EVERY_SEED}",
+        "no clear difference": "Instead of what the first row has, no difference that the seeds agree on",
+        "worse in every seed": f"Instead of what the first row has, worse {_IN_EVERY_SEED}",
+        "worse": "Instead of what the first row has, clearly worse",
+        "one seed": "Instead of what the first row has, with one seed",
+    },
+    "reference": {"": "To compare with"},
+}
 
 
 @dataclass(frozen=True)
@@ -97,14 +117,18 @@ class Line:
         """(seeds,)"""
         return np.array([float(_overall(self.values[s]) - _overall(self.base[s])) for s in self.seeds])
 
+    def mean_difference(self) -> float:
+        return float(self.overall_differences().mean())
+
     def verdict(self) -> str:
-        """worse, better, no clear difference, or one seed."""
+        """worse or better, the same "in every seed" where it is not clear, no clear difference, or one seed."""
         found = self.overall_differences()
         if len(found) < 2:
             return "one seed"
-        if not clear(found):
-            return "no clear difference"
-        return "worse" if found.mean() > 0 else "better"
+        side = "worse" if found.mean() > 0 else "better"
+        if clear(found):
+            return side
+        return f"{side} in every seed" if abs(np.sign(found).sum()) == len(found) else "no clear difference"
 
 
 def clear(differences: np.ndarray) -> np.ndarray:
@@ -177,7 +201,7 @@ def _csv(table: Table) -> str:
 
 def markdown(table: Table) -> str:
     found = lines(table)
-    parts = [_head(table), _overall_table(found), _says(found, table), _closed_form(table)]
+    parts = [_head(table), _overall_table(found), _says(found), _closed_form(table)]
     for i, colons in enumerate(table.judged):
         parts.append(_set_table(colons, i, found))
     parts += [_curves(table), _failures(table)]
@@ -188,28 +212,29 @@ def _head(table: Table) -> str:
     seeds = sorted({r.seed for r in table.results})
     tube, (width, height) = table.tube, table.size
     trained = ", ".join(_span(colon_seeds(tube, seed)[0]) for seed in seeds)
-    judged = "; ".join(f"{c.name}: {_span(c.seeds)}, {c.frames} frames each" for c in table.judged)
+    judged = "\n".join(f"- {c.name}: seeds {_span(c.seeds)}, {c.frames} frames each" for c in table.judged)
     steps = next(r.steps for r in table.results)
-    minutes = sum(r.seconds for r in table.results) / 60
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     revision = git_revision() or "unknown"
     return f"""# What each ingredient of `{table.title}` is worth
 
 Made by `{command}`
-(program of revision {revision}); not to be edited. The trainings took {minutes:.0f} min.
+(program of revision {revision}); not to be edited.
 
 Every row is the first one with one change, trained anew with seeds {", ".join(map(str, seeds))}:
 {tube.scenes} {tube.family} colons (seeds {trained}),
 {tube.frames} frames each, {width}x{height} pixels, {steps} steps of {table.batch_size} frames unless the row says
-otherwise. The rows of a seed share colons and order. Judged on colons that no row saw
-({judged}),
-depth along the axis, one median scale per frame, ray_z > .15, depth < 100 mm, inside the mask.
+otherwise. The rows of a seed share colons and order. Judged on colons that no row saw, by depth along the axis, one
+median scale per frame, ray_z > .15, depth < 100 mm, inside the mask:
+
+{judged}
 
 Numbers are **ratios to the errors of the blurred closed form** on the same frames (1: as good as one line of algebra):
 mean over the seeds (least to greatest). Overall: the geometric mean of AbsRel, RMSE and MedAE over all judged colons.
 Differences are to the first row, seed by seed; bold where their mean is larger than their spread (greatest minus least)
-over the seeds. That is a rule of thumb: by chance alone about one in ten would be bold. Images are small and training
-is short: these are directions and sizes of effects, not records.
+over the seeds. Those are rules of thumb: with three seeds and no difference at all, one row in twelve would be bold,
+and one in four would have the same sign in every seed. Images are small and training is short: these are directions
+and sizes of effects, not records.
 """
 
 
@@ -240,25 +265,20 @@ def _overall_table(found: Sequence[Line]) -> str:
     return "\n".join([*text, ""])
 
 
-def _says(found: Sequence[Line], table: Table) -> str:
+def _says(found: Sequence[Line]) -> str:
     """Which ingredients earn their place and which do not, by the rule of the table."""
-
-    def named(part: str, *verdicts: str) -> str:
-        chosen = [line for line in found[1:] if line.row.part == part and line.verdict() in verdicts]
-        chosen.sort(key=lambda line: -abs(line.overall_differences().mean()))
-        shown = [f"{line.name} ({_number(line.overall_differences().mean(), signed=True)})" for line in chosen]
-        return "; ".join(shown) or "none"
-
-    return f"""## What it says
-
-- Leaving out costs clearly, so these earn their place: {named("dropped", "worse")}.
-- Did not help: leaving out makes no clear difference: {named("dropped", "no clear difference")}.
-- Did harm here: clearly better without: {named("dropped", "better")}.
-- In place of what the base has, clearly better: {named("instead", "better")}.
-- In place of what the base has, clearly worse: {named("instead", "worse")}.
-- In place of what the base has, no clear difference: {named("instead", "no clear difference")}.
-- To compare with: {named("reference", "better", "worse", "no clear difference", "one seed")}.
-"""
+    text = ["## What it says", ""]
+    for part, headings in _HEADINGS.items():
+        of = sorted((line for line in found[1:] if line.row.part == part), key=lambda line: -line.mean_difference())
+        for verdict, heading in headings.items():
+            names = [
+                f"{line.name} ({_number(line.mean_difference(), signed=True)})"
+                for line in of
+                if verdict in ("", line.verdict())
+            ]
+            if names:
+                text.append(f"- {heading}: {'; '.join(names)}.")
+    return "\n".join([*text, ""])
 
 
 def _closed_form(table: Table) -> str:
