@@ -298,3 +298,22 @@ def test_what_cannot_be_used_is_said_and_nothing_is_left_behind(start, sequences
     with pytest.raises(InputError, match=said):
         adapt(output=tmp_path / "run", **arguments)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_map_that_teaches_keeps_quiet_about_the_frames_that_judge(start, sequences, tmp_path):
+    options = {"map": sequences / "slam", "light": "gamma=2,mu=1", "keep_worse": True, "held_out": 0.3, "steps": 3}
+    taught = adapted(start, sequences / "unlit", tmp_path / "taught", points=5.0, overlap=1.0, **options)
+    alone = adapted(start, sequences / "unlit", tmp_path / "alone", **options)
+    assert taught["before"] == alone["before"] and taught["after"]["map"] != alone["after"]["map"]
+    log = (tmp_path / "taught" / "log.txt").read_text()
+    assert (
+        "the map teaches: 7 keyframes" in log and "the map teaches" not in (tmp_path / "alone" / "log.txt").read_text()
+    )
+    assert "5 (points), 1 (overlap)" in (tmp_path / "taught" / "report.html").read_text()
+
+
+def test_a_map_cannot_teach_what_it_has_to_judge(start, sequences, tmp_path):
+    with pytest.raises(InputError, match=r"too few of its keyframes are held-out frames .* raise --held-out"):
+        adapted(start, sequences / "unlit", tmp_path / "run", map=sequences / "slam", points=1.0)
+    with pytest.raises(InputError, match=r"--points 1.0, --overlap 0.0 without --map"):
+        adapted(start, sequences / "unlit", tmp_path / "run", points=1.0)

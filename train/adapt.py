@@ -3,8 +3,8 @@
 RUN/  config.yaml  log.txt  light.json (the light that was used)  report.html  model.safetensors  model.md  run.json
 
 Start and adapted network are judged on the end of each sequence, which is never trained on, by the most trustworthy of
-three: true distance; the map's points, which no training sees; the loss, which needs neither. Where the adapted network
-is the worse one, no model is written.
+three: true distance; those of the map's points that no training sees; the loss, which needs neither. Where the adapted
+network is the worse one, no model is written.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from lightdepth.sparse_map import SparseMap
 from .adaptation import Adaptation, What, merge, source_colons, target_loss
 from .callbacks import Diagnosis, DiagnosisConfig, Progress
 from .datamodule import FrameDataModule, held_out_count
+from .map_teacher import MapTeacher
 from .running import card_text, quiet, report_every
 
 _LEAST_VIEWS = 3  # held-out keyframes below which the map's other keyframes judge too
@@ -107,6 +108,8 @@ def adapt(
     rank: int = 4,
     anchor: float = 0.0,
     replay: int = 0,
+    points: float = 0.0,
+    overlap: float = 0.0,
     held_out: float = 0.2,
     keep_worse: bool = False,
     seed: int = 0,
@@ -133,6 +136,8 @@ def adapt(
         rank: of what low_rank adds to every convolution
         anchor: weight that holds the shape of each distance map to what the checkpoint said before
         replay: synthetic colons of the kind that the checkpoint learned from, which fill half of each batch
+        points: weight of the map's points as teachers; those that a held-out frame saw only judge
+        overlap: weight of where two keyframes of the map see the same tissue
         held_out: share of each sequence, at its end, that judges and is never trained on
         keep_worse: write the model even when it got worse
         seed: of order, augmentation, replayed colons and low-rank additions
@@ -143,6 +148,11 @@ def adapt(
         raise InputError(
             f"--steps {steps}, --batch-size {batch_size}, --learning-rate {learning_rate}, --replay {replay}; "
             "expected positive numbers, and 0 or more colons"
+        )
+    if not (points >= 0 and overlap >= 0) or (map is None and points + overlap > 0):
+        raise InputError(
+            f"--points {points}, --overlap {overlap}{'' if map else ' without --map'}; expected weights of 0 or more, "
+            "and a map that teaches where they are above 0"
         )
     start = load_model(checkpoint, details=False)
     if not isinstance(start, NetworkModel):
@@ -163,7 +173,7 @@ def adapt(
             if light is None and fit_light:
                 fitted = _fitted_light(run, training, sparse_map, start)
                 if fitted is not None:
-                    frames, held = with_light(frames, fitted), with_light(held, fitted)
+                    frames, training, held = (with_light(part, fitted) for part in (frames, training, held))
                     used_light = str(run.folder / "light.json")
         write_light(frames[0].light, run.folder / "light.json")
         run.log(f"light of {data}: {_said(frames[0].light)}")
@@ -190,9 +200,15 @@ def adapt(
             + (f"; {replayed} frames of {replay} synthetic colons in half of each batch" if replay else "")
         )
         loss = target_loss(start.card, frames[0].light.reflectance > 0, replay > 0)
-        generator = torch.Generator().manual_seed(seed)
-        module = Adaptation(start, loss, learning_rate, size[1], anchor, replay > 0, what, rank, generator)
         views = [] if sparse_map is None else _views(run, frames, held, sparse_map)
+        teacher = None
+        if sparse_map is not None and points + overlap > 0:
+            teacher = _teacher(run, training, held, sparse_map, views, size, seed)
+        generator = torch.Generator().manual_seed(seed)
+        weights = {"points": points, "overlap": overlap}
+        module = Adaptation(
+            start, loss, learning_rate, size[1], anchor, replay > 0, what, rank, generator, teacher, weights
+        )
 
         shown = [held[i] for i in sorted({round(k * (len(held) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)})]
         pictures = [[DeclineModel(details=False)(frame), start(frame)] for frame in shown]
@@ -273,6 +289,29 @@ def _views(run: Run, frames: FrameSequence, held: FrameSequence, sparse_map: Spa
         return views
     run.log(f"{len(views)} keyframes of the map are held-out frames: all of its keyframes judge")
     return map_views(frames, sparse_map, frames[0].camera)
+
+
+def _teacher(
+    run: Run,
+    training: FrameSequence,
+    held: FrameSequence,
+    sparse_map: SparseMap,
+    views: Sequence[LightView],
+    size: tuple[int, int],
+    seed: int,
+) -> MapTeacher:
+    """The map as a teacher that keeps quiet about what judges."""
+    judges = {view.keyframe.number for view in views}
+    if not judges <= set(held.numbers):
+        raise InputError(
+            f"{sparse_map.source}: too few of its keyframes are held-out frames to judge what the others teach; "
+            f"{_LEAST_VIEWS} are needed: raise --held-out, or leave --points and --overlap at 0"
+        )
+    teacher = MapTeacher(training, sparse_map, size, held.numbers, seed)
+    known = sum(len(k.distances) for k in teacher.keyframes)
+    paired = sum(bool(k.partners) for k in teacher.keyframes)
+    run.log(f"the map teaches: {len(teacher.keyframes)} keyframes, {known} observed points, {paired} with partners")
+    return teacher
 
 
 def _map_error(views: Sequence[LightView], model: DepthModel) -> float | None:
@@ -380,11 +419,18 @@ def _page(
     page.table(headers, [[name, *row] for name, row in zip(names, zip(*columns, strict=True), strict=True)])
     page.text(
         f"{module.learning} weights learned; anchor {module.anchor:g}, "
-        f"{'half of each batch replayed' if module.replay else 'no replay'}. Inconsistency: how much distance changes "
+        f"{'half of each batch replayed' if module.replay else 'no replay'}; the map "
+        f"{_taught_said(module)}. Inconsistency: how much distance changes "
         "in a mirror and in less light. Pictures: the image, and distance by closed form, start and adapted network, "
         "then truth where there is any, each with its own range of colours, near in yellow."
     )
     return page
+
+
+def _taught_said(module: Adaptation) -> str:
+    if module.teacher is None:
+        return "taught nothing"
+    return "taught with weights " + ", ".join(f"{value:g} ({name})" for name, value in module.map_weights.items())
 
 
 def _picture(frame: Frame, predictions: Sequence[DepthPrediction]) -> tuple[bytes, str]:

@@ -6,11 +6,14 @@ self-supervised one, free of gain, on frames of the target; on top of it
     anchor · mean |r - median r|,  r = log t - log t_start          (the start's shape holds, its scale need not)
 
 and in the second half of each batch, where there is replay, synthetic colons with the loss that the start learned from.
+Where a map teaches (train.map_teacher), its two terms come on top, from one or two more images in every step.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, Literal
 
 import torch
@@ -27,6 +30,7 @@ from lightdepth.network.model import full_precision
 from lightdepth.predict import NetworkModel
 
 from .datamodule import TubeData
+from .map_teacher import MapTeacher, map_terms
 
 What = Literal["all", "decoder", "norms", "low_rank"]
 WHAT = ("all", "decoder", "norms", "low_rank")
@@ -126,7 +130,7 @@ class Adaptation(LightDepth):
     """A checkpoint that goes on learning, from images without truth.
 
     The first frames of a batch are the target's, and their truth is not looked at, if there is any; with `replay` the
-    second half are colons of the source.
+    second half are colons of the source. `map_weights` are those of the teacher's terms, by name.
     """
 
     def __init__(
@@ -140,6 +144,8 @@ class Adaptation(LightDepth):
         what: What = "all",
         rank: int = 4,
         generator: torch.Generator | None = None,
+        teacher: MapTeacher | None = None,
+        map_weights: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         super().__init__(start.network.config, loss, learning_rate, weight_decay=0.0, rows=rows)
         if not anchor >= 0:
@@ -148,6 +154,7 @@ class Adaptation(LightDepth):
         self.network.load_state_dict(weights)
         self.learning = let_learn(self.network, what, rank, generator)
         self.anchor, self.replay = anchor, replay
+        self.teacher, self.map_weights = teacher, map_weights
         self.start = start.network.requires_grad_(False).eval() if anchor > 0 else None
 
     def batch_loss(self, batch: FrameBatch) -> tuple[Tensor, dict[str, Tensor], Tensor]:
@@ -163,6 +170,14 @@ class Adaptation(LightDepth):
                 before = self.start(*inputs)[0][:targets]
             terms["anchor"] = anchor_loss(distance[:targets], before, batch.mask[:targets])
             total = total + self.anchor * terms["anchor"]
+        if self.teacher is not None:
+            lesson = self.teacher.lesson(self.global_step)
+            found = lesson.batch.to(self.device)
+            estimated = self.estimate(found).distance
+            with full_precision(self.device):
+                taught = map_terms(estimated, lesson)
+            terms |= {f"map_{name}": value for name, value in taught.items()}
+            total = total + sum(self.map_weights.get(name, 0.0) * value for name, value in taught.items())
         return total, terms, distance
 
 
