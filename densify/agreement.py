@@ -4,13 +4,15 @@ Notation: keyframe i with camera centre c_i; b predicted, a mapped distance, d_i
 (densify.bending); X a pixel of keyframe i placed in the map by d_i, p its projection in keyframe j. The unknowns w of
 all keyframes minimise together
 
-    sum_i sum_k rho((log a_ik - log d_i(k)) / s)                    map points k that keyframe i observed
-    + overlap sum_ij sum_X rho((log |X - c_j| - log d_j(p)) / o)    pixels of i that j sees as well
-    + sum_i w_i' diag(prior) w_i                                    the ridge of the bending
+    sum_i sum_k rho((log a_ik - log d_i(k)) / s_i)                      map points k that keyframe i observed
+    + overlap sum_ij sum_X rho((log |X - c_j| - log d_j(p)) / o_ij)     pixels of i that j sees as well
+    + sum_i w_i' diag(prior) w_i                                        the ridge of the bending
 
-with Geman-McClure's rho, s and o robust deviations of the residuals at hand (1.4826 median). Residuals are of the
-logarithm, because both a network and a triangulation err in proportion to the distance or faster. Solved by
-Gauss-Newton on sparse normal equations, with weights and projections renewed in every round; nothing in it is random.
+with Geman-McClure's rho, s_i robust deviations of the residuals at hand (1.4826 median), o_ij that of the overlap, but
+not below s_i and s_j: depth maps agree best when all of them are flat, and must not count for more, the worse they then
+fit the points. Residuals are of the logarithm, because both a network and a triangulation err in proportion to the
+distance or faster. Solved by Gauss-Newton on sparse normal equations, with weights and projections renewed in every
+round; nothing in it is random.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ class AgreementConfig:
     """What the keyframes of a submap must agree on."""
 
     on: bool = True  # off, every keyframe keeps its LMedS scale, and nothing bends
-    overlap: float = 0.1  # weight of an overlap residual against a point's; 0: keyframes do not look at each other
+    overlap: float = 0.03  # weight of an overlap residual against a point's; 0: keyframes do not look at each other
     neighbours: int = 4  # keyframes that each is compared with: those that share most points with it
     samples: int = 16  # pixels across the image that are compared, as many as that keeps square
     rounds: int = 8
@@ -100,11 +102,11 @@ def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, be
     w = np.concatenate([bend.weights for bend in bends])
     for round_ in range(config.rounds):
         widen = 2.0 ** max(0, 2 - round_)
-        rows = [
+        points = [
             _point_rows(i, view, bend, places[i], widen)
             for i, (view, bend) in enumerate(zip(views, bends, strict=True))
         ]
-        rows += _overlap_rows(views, bends, places, pairs, config)
+        rows = points + _overlap_rows(views, bends, places, pairs, config, points)
         normal, right = _normal_equations(rows, len(views), unknowns)
         step = spsolve((normal + prior).tocsc(), right - prior @ w)
         if not np.isfinite(step).all():
@@ -172,8 +174,12 @@ class _Places:
 def _point_rows(index: int, view: View, bend: Bend, places: _Places, widen: float) -> _Rows:
     o, phi = view.observed, places.at_points
     residual = np.log(o.mapped) - np.log(o.predicted) - phi @ bend.weights
-    sigma = max(1.4826 * float(np.median(np.abs(residual))), _LEAST_SIGMA)
+    sigma = _deviation(residual)
     return _Rows(residual, _weight(residual / (widen * sigma)) / sigma**2, {index: phi})
+
+
+def _deviation(residual: np.ndarray) -> float:
+    return max(1.4826 * float(np.median(np.abs(residual))), _LEAST_SIGMA)
 
 
 def _weight(x: np.ndarray) -> np.ndarray:
@@ -196,6 +202,7 @@ def _overlap_rows(
     places: Sequence[_Places],
     pairs: Sequence[tuple[int, int]],
     config: AgreementConfig,
+    points: Sequence[_Rows],
 ) -> list[_Rows]:
     found = []
     for i, view in enumerate(views):
@@ -214,8 +221,12 @@ def _overlap_rows(
                 found.append(_Rows(here.gap[use], np.ones(int(use.sum())), blocks))
     if not found:
         return []
-    sigma = max(1.4826 * float(np.median(np.abs(np.concatenate([f.residual for f in found])))), _LEAST_SIGMA)
-    return [_Rows(f.residual, config.overlap * _weight(f.residual / sigma) / sigma**2, f.blocks) for f in found]
+    together = _deviation(np.concatenate([f.residual for f in found]))
+    weighted = []
+    for f in found:
+        sigma = max(together, *(_deviation(points[i].residual) for i in f.blocks))
+        weighted.append(replace(f, weight=config.overlap * _weight(f.residual / sigma) / sigma**2))
+    return weighted
 
 
 @dataclass(frozen=True)

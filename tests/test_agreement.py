@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from colons import EXACT, colon, slam, truth
@@ -115,3 +116,21 @@ def test_what_floats_before_a_nearer_view_s_surface_is_contradicted_and_truth_is
         kept = [without(p.valid, s) for p, s in zip([first, *right[1:]], stays, strict=True)]
         assert low <= kept[0][patch].mean() <= high
         assert np.mean([k.sum() / p.valid.sum() for k, p in zip(kept, right, strict=True)]) > 0.9
+
+
+def test_depth_maps_that_err_each_in_its_own_way_are_not_flattened_so_that_they_agree():
+    """Flat maps agree best: with few points, overlap must help and not win."""
+    frames, submap, scale, shared = scene(0.3)
+    predictions, views = [], []
+    for i, (keyframe, frame) in enumerate(zip(submap.keyframes, frames, strict=True)):
+        rng, right = np.random.default_rng(i), truth(frame)
+        bumps = rng.standard_normal((5, 6)).astype(np.float32)
+        error = cv2.resize(bumps, right.distance.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        prediction = replace(right, distance=right.distance * np.exp(0.2 * error))
+        observed = observed_distances(keyframe, submap, prediction)
+        few = observed.subset(np.random.default_rng(i).permutation(len(observed)) < 30)
+        predictions.append(prediction)
+        views.append(View.of(keyframe, few, prediction, scale))
+    alone, together = (agree(views, shared, c, BendingConfig()) for c in (ALONE, AgreementConfig()))
+    assert min(bend.weights[1] for bend in together) > -0.5  # -1 is flat
+    assert np.mean(errors(together, predictions, 0.3)) < 0.9 * np.mean(errors(alone, predictions, 0.3))
