@@ -20,6 +20,9 @@ C3VD = lens("c3vd", 100, 80)
 LENSES = pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, C3VD], ids=["pinhole", "fisheye", "c3vd"])
 
 
+STEEP = RectifyConfig(max_slope=20)
+
+
 def view_of(prediction: DepthPrediction, config: RectifyConfig = RectifyConfig(), **given) -> SurfaceView:
     camera = prediction.camera
     return surface_view(prediction, np.full((camera.height, camera.width, 3), 0.5, np.float32), config, **given)
@@ -123,7 +126,7 @@ def test_colours_go_with_their_pixels():
 def test_a_finer_image_is_merged_and_no_pixel_is_lost_by_it(camera):
     fine = camera.resized(3 * camera.width + 1, 3 * camera.height + 2)
     scene = slanted_plane(fine)
-    view = view_of(scene.prediction(), RectifyConfig(focal_px=fine.focal_length / 3))
+    view = view_of(scene.prediction(), RectifyConfig(focal_px=fine.focal_length / 3, max_slope=20))
     assert len(view.weights) == (camera.width + 1) * (camera.height + 1) + 1
     known = view.weights > 0
     normal = -np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
@@ -199,18 +202,28 @@ def test_an_edge_bends_no_plane_beside_it():
 
 def test_an_edge_is_the_same_edge_at_any_image_size():
     for camera in (PINHOLE.resized(60, 44), PINHOLE, PINHOLE.resized(240, 180)):
-        weight = weights(view_of(step(camera)), camera)
+        weight = weights(view_of(step(camera), STEEP), camera)
         middle = camera.width // 2
         assert not weight[10:-10, middle - 1 : middle + 1].any()
         gentle = slanted_plane(camera, (1.0, 0.0, -0.2)).prediction()
-        assert weights(view_of(gentle), camera)[gentle.valid].min() > 0
+        assert weights(view_of(gentle, STEEP), camera)[gentle.valid].min() > 0
 
 
 def test_the_weight_falls_with_the_slant():
     scene: Scene = slanted_plane(PINHOLE, normal=(1.0, 0.0, -0.35))
     cosine = -(scene.normals * scene.rays)[0].sum(0).numpy()
     valid = scene.prediction().valid
-    np.testing.assert_allclose(weights(view_of(scene.prediction()), PINHOLE)[valid], FULL * cosine[valid], atol=1.0)
+    found = weights(view_of(scene.prediction(), STEEP), PINHOLE)
+    np.testing.assert_allclose(found[valid], FULL * cosine[valid], atol=1.0)
+
+
+def test_a_wall_seen_at_less_than_eleven_degrees_is_left_out():
+    scene: Scene = slanted_plane(PINHOLE, normal=(1.0, 0.0, -0.35))
+    cosine = -(scene.normals * scene.rays)[0].sum(0).numpy()
+    prediction = scene.prediction()
+    kept = weights(view_of(prediction), PINHOLE) > 0
+    # log distance per radian is cos / sin of the angle between ray and wall, all of it along u here
+    assert not kept[prediction.valid & (cosine < 0.15)].any() and kept[prediction.valid & (cosine > 0.25)].all()
 
 
 def test_dark_saturated_and_uncertain_pixels_weigh_little_and_are_not_lost():
