@@ -17,7 +17,7 @@ from densify.alignment import AlignmentConfig
 from densify.bending import BendingConfig
 from densify.contradiction import ContradictionConfig
 from densify.coverage import CoverageConfig
-from densify.dense_map import DenseMap
+from densify.dense_map import DenseMap, map_folders
 from densify.doctor import examine
 from densify.fusion import FusionConfig
 from densify.judge import (
@@ -303,7 +303,7 @@ def evaluate(
     """Errors of predictions, a densify run, a map or a trajectory, against truth and between submaps.
 
     Args:
-        run: folder made by densify or predict, a sparse map, or a trajectory (TUM, cam_traj_map)
+        run: folder made by densify or predict, one of its map folders (joined_000), a sparse map, or a trajectory (TUM)
         truth: sequence with true depth, and for maps with true poses; left out, a densify run's withheld points judge
         output: folder for the metrics; evaluation/ in the run when left out
         join: JSON with the Sim(3) between two submaps (first, second, scale, rotation, translation): their gap
@@ -358,7 +358,7 @@ def evaluate(
                     sequence = open_sequence(folder, format, camera, None, mask)
                     found[name] = judge_depth(source, sequence, max_depth_mm, common)
                     continue
-                if model is None or any(source.glob("map_*")) or source.is_file():
+                if model is None or map_folders(source) or source.is_file():
                     sequence, models = (
                         open_sequence(folder, format, camera, None, mask),
                         read_models(source, trajectory),
@@ -400,7 +400,7 @@ def _made_dense(
             baseline = constant.get(result.dense.submap.id)
             both = {"withheld": result.withheld, "withheld_constant": baseline}
             withheld.append(plain({"map": result.dense.submap.id, **both}))
-    dense = {m.trajectory.id: m for m in (dense_models(read_run(folder)) if any(folder.glob("map_*")) else [])}
+    dense = {m.trajectory.id: m for m in (dense_models(read_run(folder)) if map_folders(folder) else [])}
     return [dense.get(m.trajectory.id, m) for m in sparse_models(sparse_map)], withheld
 
 

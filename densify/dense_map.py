@@ -13,7 +13,7 @@ import numpy as np
 
 from densify.alignment import Alignment
 from lightdepth import native
-from lightdepth.calibration import read_camera, write_camera
+from lightdepth.calibration import read_camera, read_json, write_camera
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.folder import read_tum, write_tum
 from lightdepth.errors import InputError
@@ -193,14 +193,27 @@ class DenseMapFiles:
     views: np.ndarray | None = None
 
 
+def map_folders(path: Path) -> list[Path]:
+    """The map folders of a densify run, or the folder itself where it is one (map_000, joined_000); else none."""
+    if (path / "mesh.ply").is_file() and (path / "trajectory.tum").is_file():
+        return [path]
+    return sorted(p for p in path.glob("map_*") if p.is_dir()) if path.is_dir() else []
+
+
+def run_record(path: Path) -> dict[str, Any]:
+    """run.json of a run folder, or of the one that a map folder is in; empty where there is none."""
+    folder = path.parent if map_folders(path) == [path] else path
+    return read_json(folder / "run.json") if (folder / "run.json").is_file() else {}
+
+
 def read_dense_map(folder: Path) -> DenseMapFiles:
     """What DenseMap.write wrote. Raises InputError when it is not all there."""
     for name in ("mesh.ply", "sparse.ply", "trajectory.tum", "camera.json"):
         if not (folder / name).is_file():
             raise InputError(f"{folder}: {name} missing; expected a map folder of a `lightdepth densify` run")
-    map_id = folder.name.removeprefix("map_")
+    map_id = folder.name.removeprefix("map_").removeprefix("joined_")
     if not (map_id.isascii() and map_id.isdigit()):
-        raise InputError(f"{folder}: expected a name such as map_000, with the number of the map")
+        raise InputError(f"{folder}: expected a name such as map_000 or joined_000, with the number of the map")
     mesh, cloud = _read_ply(folder / "mesh.ply"), _read_ply(folder / "sparse.ply")
     triangles = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), int)
     numbers, poses = read_tum(folder / "trajectory.tum")

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from densify.dense_map import DenseMapFiles, Surface, read_dense_map
+from densify.dense_map import DenseMapFiles, Surface, map_folders, read_dense_map, run_record
 from densify.evaluation import (
     CUBE_MM,
     Similarity,
@@ -197,8 +197,8 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def read_run(folder: Path) -> list[DenseMapFiles]:
-    """The dense maps of a densify run. Raises InputError when there are none."""
-    maps = [read_dense_map(f) for f in sorted(folder.glob("map_*")) if f.is_dir()]
+    """The dense maps of a densify run, or of one of its map folders. Raises InputError when there are none."""
+    maps = [read_dense_map(f) for f in map_folders(folder)]
     if not maps:
         raise InputError(f"{folder}: neither map_* folders (a densify run) nor .npz files (predictions)")
     return maps
@@ -234,7 +234,7 @@ def with_trajectories(models: Sequence[Model], trajectories: Sequence[Trajectory
 def read_models(path: Path, trajectory: Path | None = None) -> list[Model]:
     """Whatever has poses at a path: a densify run, a map, or trajectories. `trajectory` replaces the keyframes' poses;
     a multi-map tree brings its own. Raises InputError saying what was found and what would be right."""
-    if path.is_dir() and any(path.glob("map_*")):
+    if map_folders(path):
         models = dense_models(read_run(path))
     elif path.is_file() and trajectory_files(path):
         return [Model(t) for t in read_trajectories(path)]
@@ -431,12 +431,12 @@ def _ms_per_keyframe(truth: Truth, keyframes: int) -> float | None:
 
 def is_made_by_us(path: Path) -> bool:
     """Whether a folder holds predictions or a densify run, so that metrics may be written into it."""
-    return path.is_dir() and (any(path.glob("*.npz")) or any(path.glob("map_*")))
+    return path.is_dir() and (any(path.glob("*.npz")) or bool(map_folders(path)))
 
 
 def in_mm(folder: Path) -> bool:
-    """Whether a densify run says that its maps are in mm."""
-    return (folder / "run.json").is_file() and read_json(folder / "run.json").get("unit") == "mm"
+    """Whether a densify run, or the one that a map folder is of, says that its maps are in mm."""
+    return run_record(folder).get("unit") == "mm"
 
 
 def withheld_errors(folder: Path) -> list[dict[str, Any]]:

@@ -18,8 +18,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from densify.coverage import patches, triangle_areas
-from densify.dense_map import DenseMapFiles, Surface
-from lightdepth.calibration import read_json
+from densify.dense_map import DenseMapFiles, Surface, run_record
 from lightdepth.errors import InputError
 from lightdepth.report import number
 
@@ -231,7 +230,7 @@ def run_unit(run: Path, mm_per_unit: float | None) -> str:
 
     Raises InputError where both say it.
     """
-    unit = str(read_json(run / "run.json").get("unit", "map units"))
+    unit = str(run_record(run).get("unit", "map units"))
     if mm_per_unit is None:
         return unit
     if not mm_per_unit > 0 or not np.isfinite(mm_per_unit):

@@ -85,6 +85,14 @@ def test_a_run_s_metrics_say_units_alignment_truth_counts_and_versions(judged):
         assert found["all"][name]["points"] == sum(m[name]["points"] for m in found["maps"])
 
 
+def test_a_joined_surface_is_judged_by_its_own_folder(judged, run, data, tmp_path):
+    shutil.copytree(run / "map_001", tmp_path / "dense" / "joined_000")
+    (tmp_path / "dense" / "run.json").write_text('{"unit": "map units"}')
+    evaluate(tmp_path / "dense" / "joined_000", data, tmp_path / "out")
+    (alone_found,) = metrics(tmp_path / "out")["maps"]
+    assert alone_found["dense"] == metrics(judged)["maps"][1]["dense"]
+
+
 def test_withheld_points_are_in_every_report_with_a_constant_distance_beside(judged, run, data, tmp_path):
     assert metrics(judged)["withheld"][0]["withheld_constant"]["median"] == 0.3
     text = (judged / "metrics.md").read_text()

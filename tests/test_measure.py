@@ -165,6 +165,11 @@ def test_the_verb_takes_pixels_of_a_keyframe_and_says_that_a_map_has_no_size(run
     )
 
 
+def test_the_verb_takes_the_folder_of_one_map_and_the_unit_of_its_run(run, capsys):
+    measure(run / "map_000", points=[tuple(on_sphere(0.2, 0)), tuple(on_sphere(0.8, 0))])
+    assert "along the surface 6" in (said := capsys.readouterr().out) and "map units" in said
+
+
 def test_the_verb_measures_areas(run, capsys):
     measure(run, points=[(0, 0, 10.0)], radius=3.0)
     assert "area 28" in capsys.readouterr().out
