@@ -70,8 +70,9 @@ class Scene:
             predictions[name] = {f.name: model(f) for f in frames[::2]}
         return cls(seed, frames, cKDTree(true_cloud(frames)), predictions)
 
-    def slam(self, seed: int) -> SimulatedSlam:
-        return simulate_slam(self.frames, SlamConfig(maps=1, spurious=0.3), seed)
+    def slam(self, seed: int, points: int = 250) -> SimulatedSlam:
+        """With so many new points for each keyframe."""
+        return simulate_slam(self.frames, SlamConfig(maps=1, spurious=0.3, points_per_keyframe=points), seed)
 
     def densified(
         self, slam: SimulatedSlam, model: Callable[[Frame], DepthPrediction], config: DensifyConfig
@@ -132,9 +133,13 @@ def against_paper(scenes: Sequence[Scene]) -> tuple[str, dict[str, np.ndarray]]:
     return table(["colon", "checkpoint", *MEASURES.values()], lines), summary
 
 
-def ablation(scenes: Sequence[Scene]) -> str:
-    """Each step dropped once: mean errors and mean ratios to full, one SLAM a scene, the default checkpoint."""
-    found = {name: [s.errors(CHECKPOINTS[0], s.slam(0), c) for s in scenes] for name, c in DROPPED.items()}
+def ablation(scenes: Sequence[Scene], points: int) -> str:
+    """Each step dropped once: mean errors and mean ratios to full, one SLAM a scene."""
+    slams = [s.slam(0, points) for s in scenes]
+    found = {
+        name: [s.errors(CHECKPOINTS[0], m, c) for s, m in zip(scenes, slams, strict=True)]
+        for name, c in DROPPED.items()
+    }
     lines = []
     for name, rows in found.items():
         cells = [f"{np.mean([r[m] for r in rows]):.2f} ({ratios(rows, found['full'], m).mean():.2f})" for m in MEASURES]
@@ -170,7 +175,8 @@ def scale_errors(scene: Scene, seed: int, config: DensifyConfig) -> np.ndarray:
 def test_full_beats_paper_and_every_step_is_dropped_once():
     scenes = [Scene.make(seed) for seed in SCENES]
     compared, summary = against_paper(scenes)
-    dropped = ablation(scenes)
+    dropped, few = ablation(scenes, 250), ablation(scenes, 30)
+    seen = [np.median([len(k.point_ids) for k in scenes[0].slam(0, n).map.submaps[0].keyframes]) for n in (250, 30)]
     lines = []
     for name, config in (("full", FULL), ("paper", PAPER)):
         errors = np.concatenate([scale_errors(s, seed, config) for s in scenes for seed in SLAM_SEEDS])
@@ -181,7 +187,8 @@ def test_full_beats_paper_and_every_step_is_dropped_once():
         "# Densify: recipe full against recipe paper\n\nMade by `LIGHTDEPTH_ABLATION=docs/densify-ablation.md pytest "
         "tests/benchmarks/bench_densify.py -o python_files='bench_*.py' -o addopts= -s`. Its docstring says what is "
         f"measured. Colons {' '.join(map(str, SCENES))}; none was tuned on.\n\n## Paper → full (ratio)\n\n{compared}"
-        f"\n## A step dropped: error (ratio to full)\n\n`{CHECKPOINTS[0]}`, one SLAM a colon.\n\n{dropped}"
+        f"\n## A step dropped: error (ratio to full)\n\n`{CHECKPOINTS[0]}`, one SLAM a colon, some {seen[0]:.0f} "
+        f"observed points a keyframe:\n\n{dropped}\nSome {seen[1]:.0f} observed points a keyframe:\n\n{few}"
         f"\n## Scale of each keyframe on true depth\n\n30 % wrong points, three SLAMs a colon.\n\n{scales}"
     )
     print(f"\n{text}")
