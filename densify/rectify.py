@@ -30,10 +30,10 @@ class RectifyConfig:
 
     focal_px: float = 256.0  # pixels per radian at most; finer images are merged, block by block
     field: str = "whole"  # or pinhole: only what an undistorted pinhole image of the same size would hold
-    # Log distance per radian above which the surface is lost from sight, an edge or nearly along the ray (11 degrees
-    # at 5): left out, on both sides, because what lies between is a mixture that would become a curtain. Smaller makes
+    # Log distance per radian above which the surface is lost from sight, an edge or nearly along the ray (5.7 degrees
+    # at 10): left out, on both sides, because what lies between is a mixture that would become a curtain. Smaller makes
     # what is there more accurate and leaves more out.
-    max_slope: float = 5.0
+    max_slope: float = 10.0
     dark: float = 0.02  # brightest channel below this: too dark to tell; the weight falls to `unlit`
     bright: float = 0.98  # brightest channel above this: clipped; the weight falls to `unlit`
     unlit: float = 0.5  # weight of a pixel in the dark or clipped; less was tried and made surfaces a little worse

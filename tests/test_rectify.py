@@ -217,13 +217,13 @@ def test_the_weight_falls_with_the_slant():
     np.testing.assert_allclose(found[valid], FULL * cosine[valid], atol=1.0)
 
 
-def test_a_wall_seen_at_less_than_eleven_degrees_is_left_out():
+def test_a_wall_seen_at_less_than_six_degrees_is_left_out():
     scene: Scene = slanted_plane(PINHOLE, normal=(1.0, 0.0, -0.35))
     cosine = -(scene.normals * scene.rays)[0].sum(0).numpy()
     prediction = scene.prediction()
     kept = weights(view_of(prediction), PINHOLE) > 0
     # log distance per radian is cos / sin of the angle between ray and wall, all of it along u here
-    assert not kept[prediction.valid & (cosine < 0.15)].any() and kept[prediction.valid & (cosine > 0.25)].all()
+    assert not kept[prediction.valid & (cosine < 0.09)].any() and kept[prediction.valid & (cosine > 0.11)].all()
 
 
 def test_dark_saturated_and_uncertain_pixels_weigh_little_and_are_not_lost():
