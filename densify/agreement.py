@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -66,9 +67,11 @@ class View:
         height, width = prediction.distance.shape
         rows = min(rows, height)
         size = (max(1, round(width * rows / height)), rows)
-        log = np.log(np.where(prediction.valid, prediction.distance, 1)).astype(np.float32)
-        share = cv2.resize(prediction.valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        log = cv2.resize(log * prediction.valid, size, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
+        # A model may call a distance valid that has no logarithm; it would spoil its neighbours.
+        known = prediction.valid & (prediction.distance > 0) & np.isfinite(prediction.distance)
+        log = np.log(np.where(known, prediction.distance, 1)).astype(np.float32)
+        share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        log = cv2.resize(log, size, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
         return cls(keyframe, observed, log, share > 0.99, scale)
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -96,9 +99,9 @@ def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, be
     if not config.on:
         return bends
     unknowns = len(bending.precision)
-    prior = sparse.diags(np.tile(bending.precision, len(views)))
+    prior = np.tile(bending.precision, len(views))
     pairs = _pairs(shared, config.neighbours) if config.overlap else []
-    places = [_Places.of(view, bend, config.samples) for view, bend in zip(views, bends, strict=True)]
+    places = [_Places(view, bend, config.samples) for view, bend in zip(views, bends, strict=True)]
     w = np.concatenate([bend.weights for bend in bends])
     for round_ in range(config.rounds):
         widen = 2.0 ** max(0, 2 - round_)
@@ -107,9 +110,8 @@ def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, be
             for i, (view, bend) in enumerate(zip(views, bends, strict=True))
         ]
         rows = points + _overlap_rows(views, bends, places, pairs, config, points)
-        normal, right = _normal_equations(rows, len(views), unknowns)
-        step = spsolve((normal + prior).tocsc(), right - prior @ w)
-        if not np.isfinite(step).all():
+        step = _step(rows, prior, prior * w, len(views))
+        if step is None:
             break  # nothing holds some unknown: stay where the last round was
         w = w + step
         bends = [replace(b, weights=w[i * unknowns : (i + 1) * unknowns]) for i, b in enumerate(bends)]
@@ -127,21 +129,32 @@ class _Rows:
     blocks: dict[int, np.ndarray]
 
 
-def _normal_equations(rows: Sequence[_Rows], views: int, unknowns: int) -> tuple[sparse.spmatrix, np.ndarray]:
-    """J' W J, sparse, and J' W r. Built block by block: views that do not meet have none."""
-    blocks: dict[tuple[int, int], np.ndarray] = {}
-    right = np.zeros((views, unknowns))
+def _step(rows: Sequence[_Rows], prior: np.ndarray, pull: np.ndarray, views: int) -> np.ndarray | None:
+    """Solves (J' W J + diag(prior)) step = J' W r - pull; None where it has no solution.
+
+    J' W J is built block by block: views that do not meet have none. One block is dense and solved as that.
+    """
+    unknowns = len(prior) // views
+    blocks = {(i, i): np.diag(part) for i, part in enumerate(np.split(prior, views))}
+    right = -pull.reshape(views, unknowns)
     for r in rows:
         for i, of_i in r.blocks.items():
             weighted = (of_i * r.weight[:, None]).T
             right[i] += weighted @ r.residual
             for j, of_j in r.blocks.items():
                 blocks[i, j] = blocks.get((i, j), 0) + weighted @ of_j
-    order = sorted(blocks)
-    first = np.searchsorted([i for i, _ in order], np.arange(views + 1))
-    data = np.stack([blocks[place] for place in order])
-    size = views * unknowns
-    return sparse.bsr_matrix((data, [j for _, j in order], first), (size, size)), right.ravel()
+    if views == 1:
+        try:
+            step = np.linalg.solve(blocks[0, 0], right[0])
+        except np.linalg.LinAlgError:
+            return None
+    else:
+        order = sorted(blocks)
+        first = np.searchsorted([i for i, _ in order], np.arange(views + 1))
+        data = np.stack([blocks[place] for place in order])
+        matrix = sparse.bsr_matrix((data, [j for _, j in order], first), (len(prior), len(prior)))
+        step = spsolve(matrix.tocsc(), right.ravel())
+    return step if np.isfinite(step).all() else None
 
 
 def _unbent(view: View, bending: BendingConfig) -> Bend:
@@ -154,21 +167,25 @@ def _unbent(view: View, bending: BendingConfig) -> Bend:
 
 @dataclass(frozen=True)
 class _Places:
-    """What no round changes: the basis at the points (n, m), and of a grid of pixels the unit rays (g, 3), the log
-    predicted distance (g,) and the basis (g, m)."""
+    """What no round changes, made when it is first asked for: one view has no use for a grid."""
 
-    at_points: np.ndarray
-    rays: np.ndarray
-    log_predicted: np.ndarray
-    basis: np.ndarray
+    view: View
+    bend: Bend
+    samples: int
 
-    @classmethod
-    def of(cls, view: View, bend: Bend, samples: int) -> _Places:
-        o, x = view.observed, view.grid(samples)
-        log_predicted, _ = view.at(x)
-        rays, _ = view.keyframe.camera.unproject(x * bend.image_size)
-        at_points = bend.basis(o.pixels / bend.image_size, np.log(o.predicted))
-        return cls(at_points, rays, log_predicted, bend.basis(x, log_predicted))
+    @cached_property
+    def at_points(self) -> np.ndarray:
+        """The basis (n, m) at the observed points."""
+        o = self.view.observed
+        return self.bend.basis(o.pixels / self.bend.image_size, np.log(o.predicted))
+
+    @cached_property
+    def grid(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of a grid of pixels the unit rays (g, 3), the log predicted distance (g,) and the basis (g, m)."""
+        x = self.view.grid(self.samples)
+        log_predicted, _ = self.view.at(x) if len(x) else (np.zeros(0), None)
+        rays, _ = self.view.keyframe.camera.unproject(x * self.bend.image_size)
+        return rays, log_predicted, self.bend.basis(x, log_predicted)
 
 
 def _point_rows(index: int, view: View, bend: Bend, places: _Places, widen: float) -> _Rows:
@@ -207,10 +224,12 @@ def _overlap_rows(
     found = []
     for i, view in enumerate(views):
         partners = [j for a, j in pairs if a == i]
-        rays, phi = places[i].rays, places[i].basis
-        if not partners or not len(rays):
+        if not partners:
             continue
-        log_d = places[i].log_predicted + phi @ bends[i].weights
+        rays, log_predicted, phi = places[i].grid
+        if not len(rays):
+            continue
+        log_d = log_predicted + phi @ bends[i].weights
         for j in partners:
             here = gap_between(view, views[j], bends[j], rays, log_d)
             moved = gap_between(view, views[j], bends[j], rays, log_d + _STEP)

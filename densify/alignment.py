@@ -100,7 +100,8 @@ def align(name: str, observed: ObservedDistances, config: AlignmentConfig) -> Al
 
 def bent(alignment: Alignment, bend: Bend, observed: ObservedDistances, config: AlignmentConfig) -> Alignment:
     """The alignment with a bend, and the points judged again: inliers within t sigma of the log residuals."""
-    residual = np.abs(np.log(observed.mapped / observed.predicted) - bend.at(observed.pixels, observed.predicted))
+    field = bend.at(observed.pixels, observed.predicted)
+    residual = np.abs(np.log(observed.mapped / observed.predicted) - field)
     sigma = inlier_sigma(float(np.median(residual)), len(residual), config.finite_sample)
     inlier = residual <= config.t * sigma + 1e-9
     found = replace(
@@ -111,8 +112,7 @@ def bent(alignment: Alignment, bend: Bend, observed: ObservedDistances, config: 
         outlier_ids=observed.point_ids[~inlier],
         bend=bend,
     )
-    predicted = observed.predicted * np.exp(bend.at(observed.pixels, observed.predicted))
-    judged = replace(found, scale=1.0), replace(observed, predicted=predicted)
+    judged = replace(found, scale=1.0), replace(observed, predicted=observed.predicted * np.exp(field))
     return replace(found, reason=distrust(*judged, inlier, config))
 
 

@@ -17,6 +17,7 @@ from densify.alignment import AlignmentConfig
 from densify.bending import BendingConfig
 from densify.contradiction import ContradictionConfig
 from densify.coverage import CoverageConfig
+from densify.coverage import coverage as coverage_of
 from densify.dense_map import DenseMap, map_folders
 from densify.doctor import examine
 from densify.fusion import FusionConfig
@@ -174,6 +175,7 @@ def live(
     bending: BendingConfig = BendingConfig(),
     rectify: RectifyConfig = RectifyConfig(),
     fusion: FusionConfig = FusionConfig(),
+    coverage: CoverageConfig = CoverageConfig(),
     sfm: SfmConfig = SfmConfig(),
     mm_per_unit: float | None = None,
     fit_light: bool = True,
@@ -197,6 +199,7 @@ def live(
         bending: how depth may bend
         rectify: which predicted pixels are fused, and how finely
         fusion: resolution and reach of the surface
+        coverage: when wall counts as seen well
         sfm: how frames are mapped when there is no map
         mm_per_unit: millimetres per map unit, where known; lengths are then written in mm
         fit_light: where nobody gave the light, fit it on the map before the clock starts
@@ -226,6 +229,7 @@ def live(
             if not len(dense.triangles):
                 run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
                 return
+            records[-1]["coverage"] = coverage_of(dense, coverage).scaled(mm_per_unit or 1.0).record()
             replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, ("ply",), mm_per_unit)
 
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:

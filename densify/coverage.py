@@ -113,10 +113,10 @@ def coverage(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> Cove
 
 def contribution(view: SurfaceView, prediction: DepthPrediction) -> Contribution:
     """What a view gives to the fusion, of all pixels that its prediction calls valid."""
-    fused = view.weights[view.weights > 0]
+    fused = int(np.count_nonzero(view.weights))
     merged = float(prediction.valid.size / (len(view.weights) - 1))
-    share = len(fused) * merged / max(int(prediction.valid.sum()), 1)
-    return Contribution(min(share, 1.0), float(fused.mean() / FULL) if len(fused) else 0.0)
+    share = fused * merged / max(int(np.count_nonzero(prediction.valid)), 1)
+    return Contribution(min(share, 1.0), int(view.weights.sum(dtype=int)) / max(fused, 1) / FULL)
 
 
 def looked_at(dense: DenseMap, keyframe: Keyframe, given: Contribution, stride: int = 8) -> Contribution:

@@ -15,20 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from densify.marching_cubes import CORNERS, marching_cubes
+from densify.compiled import compiled
+from densify.marching_cubes import BLOCK, CORNERS, REACH, Cut, cut, one_vertex_an_edge, packed
 from densify.rectify import FULL, SurfaceView
 from lightdepth.errors import InputError
 
-BLOCK = 8
-"""Voxels along the side of a block, the piece in which the volume grows."""
 STEPS = 2048
 """Steps of s / tau on either side of 0; a sum holds 4096 views of full weight."""
-_CHUNK = 32  # blocks at a time: what they need stays in the cache
 _COLORED = 2.0  # voxels from the surface that colour is kept for
 _SPARSE = 4  # every so many pixels are enough to find the blocks
-
-Block = tuple[int, int, int]
-"""The place of a block in the volume, counted in blocks."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +51,11 @@ class Mesh:
 
 
 class TsdfVolume:
-    """A truncated signed distance volume that grows where surface is seen. `voxel` in map units."""
+    """A truncated signed distance volume that grows where surface is seen. `voxel` in map units.
+
+    It grows in blocks of 8 x 8 x 8 voxels, each named by its place, counted in blocks and packed into one number
+    (densify.marching_cubes), and held in a slot.
+    """
 
     def __init__(self, voxel: float, config: FusionConfig):
         if not np.isfinite(voxel) or voxel <= 0:
@@ -64,8 +63,13 @@ class TsdfVolume:
         self.voxel = voxel
         self.views = 0
         self._config = config
-        self._rows: dict[Block, int] = {}  # place of a block, in blocks -> its row in the sums
+        self._slots: dict[int, int] = {}  # by packed place
         self._free: list[int] = []
+        self._codes = np.zeros(0, np.int64)
+        self._above = np.full((0, 8), -1, np.int32)  # the slots of the blocks at CORNERS from each; -1 where there is
+        self._below = np.full((0, 8), -1, np.int32)  # none; and of those that it is at CORNERS from
+        self._behind = np.zeros((0, BLOCK**2), np.uint8)  # bit z of 8 x + y: a voxel behind the surface
+        self._known = np.zeros((0, BLOCK**2), np.uint8)  # and one that enough views have seen
         self._weight = np.zeros((0, BLOCK**3), np.int32)
         self._distance = np.zeros((0, BLOCK**3), np.int32)
         self._seen = np.zeros((0, BLOCK**3), np.int16)
@@ -73,62 +77,52 @@ class TsdfVolume:
         place = np.arange(BLOCK) * voxel
         self._offsets = np.stack(np.meshgrid(place, place, place, indexing="ij")).reshape(3, -1).astype(np.float32)
 
-    def integrate(self, view: SurfaceView, cam_from_map: np.ndarray) -> set[Block]:
-        """Adds what a view says, its pose being cam_from_map (4, 4). The blocks that changed."""
+    def integrate(self, view: SurfaceView, cam_from_map: np.ndarray) -> np.ndarray:
+        """Adds what a view says, its pose being cam_from_map (4, 4). Packed places (n,) of the blocks whose part of the
+        surface may have changed, those that are no longer held included."""
         return self._add(view, cam_from_map, 1)
 
-    def remove(self, view: SurfaceView, cam_from_map: np.ndarray) -> set[Block]:
-        """Takes out what `integrate` added for the same view at the same pose. The blocks that changed."""
+    def remove(self, view: SurfaceView, cam_from_map: np.ndarray) -> np.ndarray:
+        """Takes out what `integrate` added for the same view at the same pose; the places as of `integrate`."""
         return self._add(view, cam_from_map, -1)
 
-    def _add(self, view: SurfaceView, cam_from_map: np.ndarray, sign: int) -> set[Block]:
-        blocks = self._touched(view, cam_from_map)
-        if not len(blocks):
-            return set()
+    def _add(self, view: SurfaceView, cam_from_map: np.ndarray, sign: int) -> np.ndarray:
+        places = self._touched(view, cam_from_map)
+        if not len(places):
+            return np.zeros(0, np.int64)
         self.views += sign
-        keys: list[Block] = [(x, y, z) for x, y, z in blocks.tolist()]
-        rows = np.array([self._row(key) for key in keys], int)
+        slots = self._hold(packed(places))
         rotation, translation = cam_from_map[:3, :3], cam_from_map[:3, 3]
-        corners = (blocks * (BLOCK * self.voxel) @ rotation.T + translation).astype(np.float32)
+        origins = (places * (BLOCK * self.voxel) @ rotation.T + translation).astype(np.float32)
         offsets = rotation.astype(np.float32) @ self._offsets
-        tau = np.float32(self._config.truncation * self.voxel)
-        for start in range(0, len(rows), _CHUNK):
-            chunk = rows[start : start + _CHUNK]
-            points = [corners[start : start + _CHUNK, a, None] + offsets[a] for a in range(3)]
-            pixels = view.table.look_up(*points)
-            m_x, m_y, m_z, b = np.moveaxis(view.planes.take(pixels, 0), -1, 0)
-            distance = b - m_x * points[0] - m_y * points[1] - m_z * points[2]
-            behind = (1 + distance / tau).clip(0, 1)  # what lies behind a wall is ever less known
-            weight = np.rint(view.weights.take(pixels) * behind).astype(np.int32)
-            steps = np.rint(distance.clip(-tau, tau) * (STEPS / tau)).astype(np.int32)
-            signed = sign * weight
-            self._weight[chunk] += signed
-            self._distance[chunk] += signed * steps
-            self._seen[chunk] += np.sign(signed).astype(np.int16)
-            block, voxel = np.nonzero((np.abs(distance) < _COLORED * self.voxel) & (weight > 0))
-            colors = view.colors.take(pixels[block, voxel], 0) * signed[block, voxel, None]
-            self._color[chunk[block], voxel] += colors
-        for i in np.flatnonzero(~self._seen[rows].any(1)):
-            self._free.append(self._rows.pop(keys[i]))
-        return set(keys)
+        any_left = _add_view(
+            self._weight, self._distance, self._seen, self._color, self._behind, self._known, slots,
+            origins, offsets, view.table.look_up(origins, offsets), view.planes, view.weights, view.colors,
+            np.float32(self._config.truncation * self.voxel), np.float32(_COLORED * self.voxel), sign,
+            self._config.min_views,
+        )  # fmt: skip
+        touched = np.unique(self._below[slots])
+        codes = self._codes[touched[touched >= 0]]
+        self._release(slots[~any_left])
+        return codes
 
     def _touched(self, view: SurfaceView, cam_from_map: np.ndarray) -> np.ndarray:
-        """Places (n, 3) of the blocks that the surface of a view passes through or comes close to."""
+        """Places (n, 3), in order, of the blocks that the surface of a view passes through or comes close to."""
         some = np.flatnonzero(view.weights)[::_SPARSE]
         if not len(some):
             return np.zeros((0, 3), int)
-        points, normals = view.points[:, some], view.planes[some, :3].T
-        rays = points * (np.float32(self._config.truncation * self.voxel) / np.sqrt((points**2).sum(0)))
-        # Along the ray as far as the view speaks; across, to where marching cubes needs a neighbour.
-        shifts = (-rays, 0, rays, -2 * np.float32(self.voxel) * normals, 2 * np.float32(self.voxel) * normals)
-        around = np.concatenate([points + shift for shift in shifts], 1)
-        rotation, translation = cam_from_map[:3, :3], cam_from_map[:3, 3]
         side = BLOCK * self.voxel
-        place = (rotation.T / side).astype(np.float32) @ around - (rotation.T @ translation / side).astype(np.float32)[
-            :, None
-        ]
-        place = np.floor(place).astype(np.int32)
-        low, high = place.min(1), place.max(1)
+        rotation = (cam_from_map[:3, :3].T / side).astype(np.float32)
+        shift = (cam_from_map[:3, :3].T @ cam_from_map[:3, 3] / side).astype(np.float32)
+        tau = np.float32(self._config.truncation * self.voxel)
+        across = np.float32(2 * self.voxel)
+        near, low, high = _blocks_near(view.points, view.planes, some, tau, across, rotation, shift)
+        farthest = BLOCK * np.abs(np.array([low, high], np.int64)).max()
+        if farthest >= REACH - 2 * BLOCK:
+            raise InputError(
+                f"voxel size {self.voxel:.3g}: one view reaches {farthest} voxels from the map's origin; at most "
+                f"{REACH} are possible: choose larger voxels"
+            )
         shape = high - low + 1
         if np.prod(shape.astype(float)) > 1e8:
             raise InputError(
@@ -136,110 +130,177 @@ class TsdfVolume:
                 "choose larger voxels"
             )
         touched = np.zeros(shape, bool)
-        touched[tuple(place - low[:, None])] = True
+        _mark(touched, near, low)
         return np.argwhere(touched) + low
 
-    def _row(self, block: Block) -> int:
-        row = self._rows.get(block)
-        if row is None:
-            if not self._free:
-                self._grow()
-            row = self._rows[block] = self._free.pop()
-        return row
+    def _hold(self, codes: np.ndarray) -> np.ndarray:
+        """The slots (n,) of blocks, which are given one where they have none."""
+        slots = self.slots(codes)
+        new = np.flatnonzero(slots < 0)
+        if len(new):
+            self._grow(len(new))
+            slots[new] = taken = [self._free.pop() for _ in range(len(new))]
+            self._codes[taken] = codes[new]
+            self._slots.update(zip(codes[new].tolist(), taken, strict=True))
+            for corner, step in enumerate(_CODE_STEPS.tolist()):
+                for here, back, way in ((self._above, self._below, step), (self._below, self._above, -step)):
+                    here[taken, corner] = there = self.slots(codes[new] + way)
+                    back[there[there >= 0], corner] = slots[new][there >= 0]
+        return slots
 
-    def _grow(self) -> None:
-        held = len(self._weight)
-        more = max(256, held // 2)
-        for name in ("_weight", "_distance", "_seen", "_color"):
+    def _release(self, slots: np.ndarray) -> None:
+        """Gives up blocks that hold nothing."""
+        if not len(slots):
+            return
+        for corner in range(8):
+            for here, back in ((self._above, self._below), (self._below, self._above)):
+                there = here[slots, corner]
+                back[there[there >= 0], corner] = -1
+        self._above[slots] = self._below[slots] = -1
+        for slot, code in zip(slots.tolist(), self._codes[slots].tolist(), strict=True):
+            del self._slots[code]
+            self._free.append(slot)
+
+    def _grow(self, wanted: int) -> None:
+        held = len(self._codes)
+        if wanted <= len(self._free):
+            return
+        more = max(256, held // 2, wanted)
+        for name in ("_codes", "_above", "_below", "_behind", "_known", "_weight", "_distance", "_seen", "_color"):
             array = getattr(self, name)
-            setattr(self, name, np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)]))
-        self._free = list(range(held + more - 1, held - 1, -1))
+            fill = -1 if name in ("_above", "_below") else 0
+            setattr(self, name, np.concatenate([array, np.full((more, *array.shape[1:]), fill, array.dtype)]))
+        self._free += range(held + more - 1, held - 1, -1)
 
-    def slots(self, places: np.ndarray) -> np.ndarray:
-        """Where blocks (n, 3) are held (n,); -1 where there is none."""
-        return np.array([self._rows.get((x, y, z), -1) for x, y, z in places.tolist()], int)
-
-    def sides(self, slots: np.ndarray) -> np.ndarray:
-        """Of held blocks (n,): 1 has voxels behind the surface, 2 before it, 3 both: only there is any surface."""
-        known, behind = self._known(slots), self._distance[slots] < 0
-        return (known & behind).any(1) + np.uint8(2) * (known & ~behind).any(1)
-
-    def values(self, slots: np.ndarray) -> np.ndarray:
-        """Signed distance (n, 8, 8, 8) of held blocks (n,) in truncations, NaN where too few views have seen it."""
-        mean = self._distance[slots] / np.maximum(self._weight[slots], 1).astype(np.float32) / np.float32(STEPS)
-        return np.where(self._known(slots), mean, np.float32(np.nan)).reshape(-1, BLOCK, BLOCK, BLOCK)
-
-    def color_sums(self, voxels: np.ndarray) -> np.ndarray:
-        """Weighted sums of red, green, blue (0 to 255) and of the weights (n, 4), at voxels 512 slot + place (n,)."""
-        return self._color.reshape(-1, 4).take(voxels, 0)
-
-    def _known(self, slots: np.ndarray) -> np.ndarray:
-        return (self._weight[slots] > 0) & (self._seen[slots] >= self._config.min_views)
+    def slots(self, codes: np.ndarray) -> np.ndarray:
+        """Where blocks (n,), packed, are held (n,); -1 where there is none."""
+        return np.array([self._slots.get(code, -1) for code in codes.tolist()], np.int64)
 
     @property
-    def capacity(self) -> int:
-        """Places for blocks, used or not: slots are below it."""
-        return len(self._weight)
+    def places(self) -> np.ndarray:
+        """Packed places (n,) of all blocks that hold anything, in order."""
+        return np.sort(np.fromiter(self._slots, np.int64, len(self._slots)))
 
-    @property
-    def blocks(self) -> set[Block]:
-        """Places of all blocks that hold anything."""
-        return set(self._rows)
+    def cut(self, slots: np.ndarray) -> Cut:
+        """The surface in the blocks at slots (n,)."""
+        return cut(self._distance, self._weight, self._behind, self._known, self._above, self._codes, slots)
 
-    def extract_mesh(self, blocks: set[Block] | None = None) -> Mesh:
-        """The surface, or the part of it in some blocks' cells; empty when nothing was seen.
+    def colors_at(self, found: Cut) -> np.ndarray:
+        """Colours (v, 3) float32, 0 to 255, of the vertices of a cut."""
+        return _mean_colors(self._color.reshape(-1, 4), found.near, found.far, found.share)
 
-        A cell with a corner that too few views have seen has no surface. Cells reach into the next blocks: what
-        changed with a set of blocks is in `reaching(blocks)`.
-        """
-        wanted = self.blocks if blocks is None else blocks & self.blocks
-        needed = wanted if blocks is None else {_moved(b, c) for b in wanted for c in CORNERS.tolist()} & self.blocks
-        places = np.array(sorted(needed), np.int64).reshape(-1, 3)
-        shape = (len(places), BLOCK, BLOCK, BLOCK)
-        keys: list[Block] = [(x, y, z) for x, y, z in places.tolist()]
-        rows = np.array([self._rows[key] for key in keys], int)
-        weight, seen = self._weight[rows], self._seen[rows]
-        known = (weight > 0) & (seen >= self._config.min_views)
-        values = np.where(known, self._distance[rows] / np.maximum(weight, 1), np.nan).astype(np.float32)
-        cells_of = np.array([key in wanted for key in keys], bool)
-        first, second, share, triangles = marching_cubes(values.reshape(shape), _neighbors(places), cells_of)
-
-        def at(voxels: np.ndarray) -> np.ndarray:
-            block, *inner = np.unravel_index(voxels, shape)
-            return (places[block] * BLOCK + np.stack(inner, -1)) * self.voxel
-
-        def between(sums: np.ndarray) -> np.ndarray:
-            flat = sums.reshape(-1, *sums.shape[2:])
-            t = share.reshape(-1, *[1] * (flat.ndim - 1))
-            return (1 - t) * flat[first] + t * flat[second]
-
-        t = share[:, None]
-        color = between(self._color[rows])
+    def extract_mesh(self) -> Mesh:
+        """The whole surface; empty when nothing was seen. A cell with a corner that too few views saw has none."""
+        found = self.cut(self.slots(self.places))
+        starts = np.repeat(found.first_vertex[:-1], np.diff(found.first_triangle))
+        first, triangles = one_vertex_an_edge(found.names, found.triangles + starts[:, None])
+        near, far, share = found.near[first], found.far[first], found.share[first]
+        weight, seen = self._weight.reshape(-1), self._seen.reshape(-1)
         return Mesh(
-            (1 - t) * at(first) + t * at(second),
+            found.positions[first] * self.voxel,
             triangles,
-            color[:, :3] / (255 * np.maximum(color[:, 3:], 1e-9)),
-            between(weight) / FULL,
-            np.where(share < 0.5, seen.reshape(-1)[first], seen.reshape(-1)[second]).astype(int),
+            self.colors_at(found)[first] / 255.0,
+            ((1 - share) * weight[near] + share * weight[far]) / FULL,
+            np.where(share < 0.5, seen[near], seen[far]).astype(int),
         )
 
 
-def reaching(blocks: set[Block]) -> set[Block]:
-    """Blocks with a cell that has a corner in one of `blocks`: those whose surface changes with them."""
-    return {_moved(b, (-c).tolist()) for b in blocks for c in CORNERS}
+_CODE_STEPS = packed(CORNERS) - packed(np.zeros((1, 3), int))  # to the eight corners, in packed places
 
 
-def _moved(block: Block, by: list[int]) -> Block:
-    return block[0] + by[0], block[1] + by[1], block[2] + by[2]
+@compiled
+def _add_view(
+    weight, distance, seen, color, behind, known, slots,
+    origins, offsets, pixels, planes, weights, colors,
+    tau, colored, sign, least,
+):  # fmt: skip
+    """Adds sign times what a view says to the sums of the blocks at slots (n,). The voxels of a block are at its
+    origin (n, 3) + offsets (3, 512), in camera axes, and in its pixels (n, 512). Which blocks (n,) hold anything then.
+    """
+    # Loops of one kind each, and choices instead of min and max: so those over sums are done eight at a time.
+    zero, one, sign = np.float32(0), np.float32(1), np.int32(sign)
+    steps, per_tau = np.float32(STEPS) / tau, one / tau
+    plane = np.empty((4, 512), np.float32)
+    full, s = np.empty(512, np.float32), np.empty(512, np.float32)
+    signed = np.empty(512, np.int32)
+    any_left = np.zeros(len(slots), np.bool_)
+    for i in range(len(slots)):
+        slot, pixel = slots[i], pixels[i]
+        for v in range(512):
+            for k in range(4):
+                plane[k, v] = planes[pixel[v], k]
+            full[v] = weights[pixel[v]]
+        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
+        sum_w, sum_ws, count = weight[slot], distance[slot], seen[slot]
+        for v in range(512):
+            d = plane[3, v] - plane[0, v] * (x + offsets[0, v])
+            d = d - plane[1, v] * (y + offsets[1, v]) - plane[2, v] * (z + offsets[2, v])
+            s[v] = d
+            trust = one + d * per_tau  # what lies behind a wall is ever less known
+            trust = trust if trust > zero else zero
+            trust = trust if trust < one else one
+            d = d if d < tau else tau
+            d = d if d > -tau else -tau
+            w = np.int32(np.rint(full[v] * trust)) * sign
+            signed[v] = w
+            sum_w[v] += w
+            sum_ws[v] += w * np.int32(np.rint(d * steps))
+            count[v] += np.int16(sign) if w != 0 else np.int16(0)
+        left = np.int16(0)
+        for column in range(64):
+            bits_b = bits_k = 0
+            for z in range(8):
+                v = 8 * column + z
+                left |= count[v]
+                bits_b |= (sum_ws[v] < 0) << z
+                bits_k |= (sum_w[v] > 0 and count[v] >= least) << z
+            behind[slot, column], known[slot, column] = bits_b, bits_k
+        any_left[i] = left != 0
+        for v in range(512):
+            if signed[v] != 0 and abs(s[v]) < colored:
+                for k in range(4):
+                    color[slot, v, k] += signed[v] * colors[pixel[v], k]
+    return any_left
 
 
-def _neighbors(places: np.ndarray) -> np.ndarray:
-    """Rows (n, 8) of the blocks at CORNERS from each of the places (n, 3), which are sorted; -1 where there is none."""
-    if not len(places):
-        return np.zeros((0, 8), int)
-    from_low = places - places.min(0)
-    shape = from_low.max(0) + 2
-    keys = np.ravel_multi_index(from_low.T, shape)
-    wanted = np.ravel_multi_index((from_low[:, None] + CORNERS).reshape(-1, 3).T, shape).reshape(-1, 8)
-    row = np.searchsorted(keys, wanted).clip(max=len(keys) - 1)
-    return np.where(keys[row] == wanted, row, -1)
+@compiled
+def _blocks_near(points, planes, some, tau, across, rotation, shift):
+    """Places (5 n, 3) int32 of the blocks at the points of some pixels (n,), tau before and behind them along the ray,
+    as far as the view speaks, and `across` to both sides of the surface, where marching cubes needs a neighbour; the
+    lowest (3,) and the highest (3,)."""
+    near = np.empty((5 * len(some), 3), np.int32)
+    low, high = np.full(3, 2**31 - 1, np.int32), np.full(3, -(2**31), np.int32)
+    step = np.empty(5, np.float32)
+    for i in range(len(some)):
+        pixel = some[i]
+        x, y, z = points[0, pixel], points[1, pixel], points[2, pixel]
+        reach = tau / np.sqrt(x * x + y * y + z * z)
+        u, v, w = across * planes[pixel, 0], across * planes[pixel, 1], across * planes[pixel, 2]
+        for a in range(3):
+            place = rotation[a, 0] * x + rotation[a, 1] * y + rotation[a, 2] * z
+            aside = rotation[a, 0] * u + rotation[a, 1] * v + rotation[a, 2] * w
+            step[0], step[1], step[2], step[3], step[4] = 0, place * reach, -place * reach, aside, -aside
+            for k in range(5):
+                block = np.int32(np.floor(place + step[k] - shift[a]))
+                near[5 * i + k, a] = block
+                low[a], high[a] = min(low[a], block), max(high[a], block)
+    return near, low, high
+
+
+@compiled
+def _mark(marked, places, low):
+    """Sets marked (x, y, z) at places (n, 3), counted from `low`."""
+    for i in range(len(places)):
+        marked[places[i, 0] - low[0], places[i, 1] - low[1], places[i, 2] - low[2]] = True
+
+
+@compiled
+def _mean_colors(color, near, far, share):
+    """Mean colours (n, 3) from weighted sums (m, 4), `share` of the way between rows `near` and `far` (n,) of them."""
+    out = np.empty((len(share), 3), np.float32)
+    for i in range(len(share)):
+        one, two, t = near[i], far[i], share[i]
+        weight = max((1 - t) * color[one, 3] + t * color[two, 3], 1e-9)
+        for c in range(3):
+            out[i, c] = ((1 - t) * color[one, c] + t * color[two, c]) / weight
+    return out

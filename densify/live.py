@@ -20,9 +20,11 @@ import numpy as np
 
 from densify.agreement import View, agree
 from densify.alignment import Alignment, align, bent
-from densify.dense_map import DenseMap
-from densify.fusion import Block, TsdfVolume
-from densify.marching import BlockSurface, Patch, joined, packed, unpacked
+from densify.coverage import contribution, looked_at
+from densify.dense_map import Contribution, DenseMap
+from densify.fusion import TsdfVolume
+from densify.marching import BlockSurface, Patch, joined
+from densify.marching_cubes import unpacked
 from densify.packed import PackedView, packed_view
 from densify.pipeline import DensifyConfig, Model, split_withheld, typical_distance
 from densify.rectify import SurfaceView, surface_view
@@ -69,12 +71,13 @@ class LiveMesh:
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """A keyframe, the positions (n, 3) of the points that it observed, and how it was fused."""
+    """A keyframe, the positions (n, 3) of the points that it observed, how it was fused, and what it gave."""
 
     keyframe: Keyframe
     points: np.ndarray
     view: PackedView
     alignment: Alignment
+    given: Contribution | None = None
 
 
 class Densifier:
@@ -126,6 +129,7 @@ class Densifier:
         ghost = Densifier(self._model, self.config, light=self._light, mask=self._mask)
         ghost.add_keyframe(image, Keyframe("0", camera, np.eye(4), pixels, np.arange(len(points))), points)
         ghost.mesh()
+        ghost.remove_keyframes(["0"])
 
     def add_keyframe(self, image: np.ndarray | Frame, keyframe: Keyframe, points: np.ndarray) -> Alignment:
         """Predicts, aligns and fuses a keyframe; its alignment, or the reason why it took no part.
@@ -148,10 +152,8 @@ class Densifier:
             view, prediction = packed_view(prediction, frame.image)
         with self._timed("align"):
             alignment = self._aligned(keyframe, points, prediction)
-        kept = _Kept(keyframe, points, view, alignment)
         with self._timed("integrate"):
-            self._add(kept, self._view(kept, prediction))
-        self._kept[keyframe.name] = kept
+            self._add(_Kept(keyframe, points, view, alignment), prediction)
         return alignment
 
     def update_poses(
@@ -206,15 +208,14 @@ class Densifier:
             raise InputError(f"keyframe {missing[0]}: its pose in map {self.id} is missing")
         where = _Positions(point_ids, points)
         moved = {name: self._moved(kept, poses[name], where) for name, kept in new.items()}
-        for name, kept in moved.items():
-            self._kept[name] = kept
-            self._add(kept, self._view(kept))
+        for kept in moved.values():
+            self._add(kept)
         return len(moved)
 
     def mesh(self) -> LiveMesh:
         """The surface as it is now. Costs what has changed since the last call, not what the map has grown to."""
         with self._timed("extract"):
-            changed = np.unique(np.concatenate(self._changed)) if self._changed else np.zeros(0, np.int64)
+            changed = np.concatenate([np.zeros(0, np.int64), *self._changed])
             self._changed = []
             if self._volume is not None:
                 self._surface.renew(self._volume, changed)
@@ -233,7 +234,9 @@ class Densifier:
         volume = TsdfVolume(1.0, self.config.fusion) if self._volume is None else self._volume
         mesh = volume.extract_mesh()
         surface = (mesh.vertices, mesh.triangles, mesh.colors)
-        return DenseMap(submap, *surface, self.alignments, volume.voxel, weights=mesh.weights, views=mesh.views)
+        dense = DenseMap(submap, *surface, self.alignments, volume.voxel, weights=mesh.weights, views=mesh.views)
+        given = {k.keyframe.name: looked_at(dense, k.keyframe, k.given) for k in self._kept.values() if k.given}
+        return replace(dense, contributions=given)
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:
@@ -286,37 +289,39 @@ class Densifier:
         if self._volume is not None and (2 * len(pairs) > len(self._kept) or not fits):
             self._changed.append(self._surface.places)
             self._volume = TsdfVolume(self._volume.voxel if fits else voxel, self.config.fusion)
-            for kept in self._kept.values():
-                self._add(kept, self._view(kept))
+            for kept in list(self._kept.values()):
+                self._add(kept)
             return len(pairs)
         for old, new in pairs:
             view = self._take_out(old)
-            self._add(new, view if new.alignment is old.alignment else self._view(new))
+            self._add(new, view=view if new.alignment is old.alignment else None)
         return len(pairs)
 
-    def _view(self, kept: _Kept, prediction: DepthPrediction | None = None) -> SurfaceView | None:
-        if not kept.alignment.ok:
-            return None
-        prediction = kept.view.prediction() if prediction is None else prediction
+    def _view(self, kept: _Kept, prediction: DepthPrediction) -> SurfaceView:
         reach = self.config.fusion.far * kept.alignment.range_90
         return surface_view(kept.alignment.applied(prediction), kept.view.image(), self.config.rectify, reach)
 
-    def _add(self, kept: _Kept, view: SurfaceView | None) -> None:
-        if view is None:
-            return
-        if self._volume is None:
-            self._volume = TsdfVolume(self._voxel(kept), self.config.fusion)
-        self._note(self._volume.integrate(view, kept.keyframe.cam_from_map))
+    def _add(self, kept: _Kept, prediction: DepthPrediction | None = None, view: SurfaceView | None = None) -> None:
+        """Keeps a keyframe, in the place of one of the same name, and fuses it if it is aligned. Its prediction and its
+        view are made from what is kept where they are not at hand."""
+        given = None
+        if kept.alignment.ok:
+            if view is None:
+                prediction = kept.view.prediction() if prediction is None else prediction
+                view = self._view(kept, prediction)
+                given = contribution(view, prediction)
+            if self._volume is None:
+                self._volume = TsdfVolume(self._voxel(kept), self.config.fusion)
+            self._changed.append(self._volume.integrate(view, kept.keyframe.cam_from_map))
+        self._kept[kept.keyframe.name] = kept if given is None else replace(kept, given=given)
 
     def _take_out(self, kept: _Kept) -> SurfaceView | None:
-        view = self._view(kept)
-        if view is not None:
-            assert self._volume is not None
-            self._note(self._volume.remove(view, kept.keyframe.cam_from_map))
+        if not kept.alignment.ok:
+            return None
+        view = self._view(kept, kept.view.prediction())
+        assert self._volume is not None
+        self._changed.append(self._volume.remove(view, kept.keyframe.cam_from_map))
         return view
-
-    def _note(self, changed: set[Block]) -> None:
-        self._changed.append(packed(np.array(list(changed), np.int64).reshape(-1, 3)))
 
     def _voxel(self, first: _Kept | None = None) -> float:
         """As densify chooses it, from the first keyframe that was aligned: a live map has no more at that time."""

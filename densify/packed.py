@@ -7,18 +7,19 @@ instead of 1.6 MB, points included. What is fused is what is kept, rounding incl
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from densify.compiled import compiled
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.sequence import decode, unit_range
 from lightdepth.prediction import DepthPrediction
 
 _JPEG_QUALITY = 95
 _STEPS, _FEW_STEPS = 65534, 254  # code 0 is invalid
+_ONES = 24  # at most, before a number is written in full
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,7 @@ class PackedField:
 
     def values(self) -> tuple[np.ndarray, np.ndarray]:
         """Values float32, 1 where invalid, and validity, both (H, W)."""
-        change = np.frombuffer(zlib.decompress(self.data), np.uint16).reshape(self.shape)
-        codes = np.cumsum(np.cumsum(change, axis=1, dtype=np.uint16), axis=0, dtype=np.uint16)
+        codes = _read(np.frombuffer(self.data, np.uint8), *self.shape)
         return _decoded(codes, self.low, self.high, self.steps)
 
 
@@ -91,9 +91,7 @@ def _packed(values: np.ndarray, valid: np.ndarray, steps: int) -> tuple[PackedFi
     log = np.log(np.where(valid, values, np.float32(np.exp(low)))).clip(low, high)
     codes = np.rint((log - low) * (steps / max(high - low, 1e-9))).astype(np.uint16) + np.uint16(1)
     codes[~valid] = 0
-    # Second differences of smooth codes are small, and compress to a third.
-    change = np.diff(np.diff(codes, axis=0, prepend=np.uint16(0)), axis=1, prepend=np.uint16(0))
-    field = PackedField(codes.shape, low, high, steps, zlib.compress(np.ascontiguousarray(change).tobytes(), 1))
+    field = PackedField(codes.shape, low, high, steps, _written(codes).tobytes())
     return field, _decoded(codes, low, high, steps)
 
 
@@ -101,3 +99,81 @@ def _decoded(codes: np.ndarray, low: float, high: float, steps: int) -> tuple[np
     valid = codes > 0
     step = (high - low) / steps
     return np.where(valid, np.exp(np.float32(low) + np.float32(step) * (codes - np.float32(1))), 1), valid
+
+
+@compiled
+def _written(codes):
+    """Codes (h, w) uint16 as bytes: how far each is from where its three neighbours before it would have it, in the
+    Golomb code that suits the last of them (Rice; adapted as in JPEG-LS), or in full where that is longer."""
+    out = np.empty(5 * codes.size + 8, np.uint8)
+    buffer, bits, at = np.uint64(0), 0, 0
+    total, count = 64, 4
+    for row in range(codes.shape[0]):
+        for column in range(codes.shape[1]):
+            off = np.int64(np.int16(np.int64(codes[row, column]) - _guess(codes, row, column)))
+            number = off << 1 ^ off >> 63
+            k = _parameter(total, count)
+            ones = number >> k
+            if ones < _ONES:
+                length, word = ones + 1 + k, ((1 << ones) - 1) << k + 1 | number & (1 << k) - 1
+            else:
+                length, word = _ONES + 16, ((1 << _ONES) - 1) << 16 | number
+            buffer, bits = buffer << np.uint64(length) | np.uint64(word), bits + length
+            while bits >= 8:
+                bits -= 8
+                out[at] = buffer >> np.uint64(bits) & np.uint64(255)
+                at += 1
+            total, count = _adapted(total, count, number)
+    out[at] = buffer << np.uint64(8 - bits) & np.uint64(255)
+    return out[: at + 1].copy()
+
+
+@compiled
+def _read(data, height, width):
+    """The codes (height, width) that were `_written`."""
+    codes = np.empty((height, width), np.uint16)
+    at = 0  # bit
+    total, count = 64, 4
+    for row in range(height):
+        for column in range(width):
+            k = _parameter(total, count)
+            ones = 0
+            while ones < _ONES and data[at >> 3] >> (7 - (at & 7)) & 1:
+                ones += 1
+                at += 1
+            if ones < _ONES:
+                at += 1
+                number, length = ones, k
+            else:
+                number, length = 0, 16
+            for _ in range(length):
+                number = number << 1 | data[at >> 3] >> (7 - (at & 7)) & 1
+                at += 1
+            total, count = _adapted(total, count, number)
+            off = number >> 1 ^ -(number & 1)
+            codes[row, column] = np.uint16(_guess(codes, row, column) + off & 65535)
+    return codes
+
+
+@compiled
+def _guess(codes, row, column):
+    """A plane through the three neighbours before a code; 0 beyond the image."""
+    left = np.int64(codes[row, column - 1]) if column > 0 else 0
+    up = np.int64(codes[row - 1, column]) if row > 0 else 0
+    return left + up - np.int64(codes[row - 1, column - 1]) if row > 0 and column > 0 else left + up
+
+
+@compiled
+def _parameter(total, count):
+    """Low bits to write as they are, for numbers whose mean is total / count."""
+    k = 0
+    while count << k < total:
+        k += 1
+    return k
+
+
+@compiled
+def _adapted(total, count, number):
+    """The sum and number of what was written, the older the less."""
+    total, count = total + number, count + 1
+    return (total >> 1, count >> 1) if count == 32 else (total, count)

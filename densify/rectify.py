@@ -16,6 +16,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from densify.compiled import compiled
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
@@ -55,14 +56,9 @@ class DirectionTable:
     scale: float
     outside: int
 
-    def look_up(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Pixels of directions, all of one shape."""
-        size, length = np.float32(len(self.cells)), np.sqrt(x * x + y * y + z * z)
-        # A little aside, so that straight behind is far out instead of in the middle.
-        aside = length * np.float32(1e-5)
-        scale = np.float32(self.scale) / np.maximum(length + z, np.maximum(np.float32(0.1) * aside, np.float32(1e-30)))
-        column, row = (((side + aside) * scale + size / 2).clip(0, size - 1).astype(np.int32) for side in (x, y))
-        return self.cells.take(row * np.int32(size) + column)
+    def look_up(self, origins: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        """Pixels (n, m) int32 of the directions of points origins (n, 3) + offsets (3, m), float32."""
+        return _look_up(self.cells, np.float32(self.scale), origins, offsets)
 
 
 @dataclass(frozen=True)
@@ -102,10 +98,10 @@ def surface_view(
     if config.field == "pinhole":
         valid &= lens.in_pinhole
     distance = np.where(valid, prediction.distance, 1).astype(np.float32, copy=False)
-    light = image.max(-1).astype(np.float32)
+    light = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2]).astype(np.float32)
     color, sigma = image, prediction.uncertainty
     points = distance * lens.rays if merged == 1 else None
-    edge: np.ndarray | bool = False
+    edge = np.zeros(valid.shape, bool)
     if merged > 1:
         points = np.stack([_merge(distance * axis, valid, merged) for axis in np.moveaxis(camera.rays()[0], -1, 0)])
         log = np.log(distance)
@@ -116,24 +112,16 @@ def surface_view(
         light, sigma = _merge(light, valid, merged), None if sigma is None else _merge(sigma, valid, merged)
         color = np.stack([_merge(image[..., c], valid, merged) for c in range(3)], -1)
         valid = _merge(valid, np.ones_like(valid), merged) > 0
-        distance = np.where(valid, np.sqrt((points**2).sum(0)), 1)
+        distance = np.where(valid, np.sqrt((points**2).sum(0)), np.float32(1))
     assert points is not None
-    normals, edges = _normals(points, distance, valid, lens, config.max_slope)
-    cosine = (normals * lens.rays).sum(0)
-    weight = FULL * cosine * light_weight(light, config)
+    trust = light_weight(light, config)
     if sigma is not None:
-        weight /= 1 + (sigma / config.sigma) ** 2
-    known = valid & ~(edges | edge) & (distance <= max_distance)
-    weight = np.where(known, np.rint(np.clip(weight, 1, FULL)), 0)
-    count = valid.size
-    planes = np.empty((count + 1, 4), np.float32)
-    planes[:count, :3] = normals.reshape(3, count).T
-    planes[:count, 3] = (normals * points).sum(0).ravel()
-    weights, colors = np.zeros(count + 1, np.uint8), np.zeros((count + 1, 4), np.uint8)
-    weights[:count] = weight.ravel()
-    colors[:count, :3], colors[:, 3] = (np.clip(color, 0, 1) * 255 + 0.5).reshape(-1, 3), 1
-    planes[weights == 0] = 0
-    points = np.concatenate([points.reshape(3, count), np.zeros((3, 1), np.float32)], 1)
+        trust /= 1 + (sigma / np.float32(config.sigma)) ** 2
+    planes, weights, colors = _planes(
+        points, distance, valid & (distance <= max_distance), valid, edge, trust.astype(np.float32, copy=False), color,
+        lens.rays, *lens.gaps, np.float32(config.max_slope),
+    )  # fmt: skip
+    points = np.concatenate([points.reshape(3, -1), np.zeros((3, 1), np.float32)], 1)
     return SurfaceView(points, planes, weights, colors, lens.table)
 
 
@@ -143,32 +131,61 @@ def light_weight(value: np.ndarray, config: RectifyConfig) -> np.ndarray:
     return config.unlit + (1 - config.unlit) * lit
 
 
-def _normals(
-    points: np.ndarray, distance: np.ndarray, valid: np.ndarray, lens: _Lens, max_slope: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals away from the camera (3, h, w), and the pixels beside an edge (h, w).
+@compiled
+def _planes(points, distance, near, valid, edge, trust, color, rays, gaps_u, gaps_v, max_slope):
+    """Planes (n + 1, 4), weights (n + 1,) and colours (n + 1, 4) of the pixels, and of none.
 
-    P_u x P_v, with differences of P to both sides, or to one where the other is across an edge or unknown: exact on a
-    plane. A pixel with no neighbour along an axis faces the camera.
+    The normal is P_u x P_v, away from the camera, with differences of P to both sides, or to one where the other is
+    across an edge or unknown: exact on a plane. A pixel with no neighbour along an axis faces the camera. Beside an
+    edge, on either side, and where a pixel is not `near` (h, w) nothing is known.
     """
-    edges, sums = np.zeros(valid.shape, bool), []
-    for axis, gap in zip((1, 0), lens.gaps, strict=True):
-        (one, two), (here, there) = _halves(distance, axis), _halves(valid, axis)
-        both = here & there
-        across = both & (np.abs(two - one) > max_slope * gap * np.minimum(one, two))
-        for side in _halves(edges, axis):
-            side |= across
-        one, two = _halves(points, axis)
-        steps = (two - one) * (both & ~across)
-        total = np.zeros_like(points)
-        for side in _halves(total, axis):
-            side += steps
-        sums.append(total)
-    (a, b, c), (d, e, f) = sums
-    normals = np.stack([b * f - c * e, c * d - a * f, a * e - b * d])
-    length = np.sqrt((normals**2).sum(0))
-    normals = np.where(length > 0, normals / np.maximum(length, 1e-30), lens.rays)
-    return normals, edges
+    height, width = valid.shape
+    planes = np.zeros((height * width + 1, 4), np.float32)
+    weights, colors = np.zeros(height * width + 1, np.uint8), np.zeros((height * width + 1, 4), np.uint8)
+    zero, one, full = np.float32(0), np.float32(1), np.float32(FULL)
+    steps = np.empty((2, 3), np.float32)
+    for row in range(height):
+        for column in range(width):
+            i = row * width + column
+            for c in range(3):
+                colors[i, c] = np.uint8(min(max(np.float32(color[row, column, c]), zero), one) * full + np.float32(0.5))
+            if edge[row, column] or not near[row, column]:
+                continue
+            steps[:] = 0
+            across = False
+            here = distance[row, column]
+            for axis in range(2):
+                for way in (-1, 1):
+                    r, c = (row, column + way) if axis == 0 else (row + way, column)
+                    if r < 0 or c < 0 or r >= height or c >= width or not valid[r, c]:
+                        continue
+                    gap = gaps_u[row, min(c, column)] if axis == 0 else gaps_v[min(r, row), column]
+                    there = distance[r, c]
+                    if abs(there - here) > max_slope * gap * min(here, there):
+                        across = True
+                    elif way > 0:
+                        for k in range(3):
+                            steps[axis, k] += points[k, r, c] - points[k, row, column]
+                    else:
+                        for k in range(3):
+                            steps[axis, k] += points[k, row, column] - points[k, r, c]
+            if across:
+                continue
+            x = steps[0, 1] * steps[1, 2] - steps[0, 2] * steps[1, 1]
+            y = steps[0, 2] * steps[1, 0] - steps[0, 0] * steps[1, 2]
+            z = steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]
+            length = np.sqrt(x * x + y * y + z * z)
+            ray_x, ray_y, ray_z = rays[0, row, column], rays[1, row, column], rays[2, row, column]
+            if length > 0:
+                x, y, z = x / length, y / length, z / length
+            else:
+                x, y, z = ray_x, ray_y, ray_z
+            cosine = x * ray_x + y * ray_y + z * ray_z
+            weights[i] = np.uint8(np.rint(min(max(full * cosine * trust[row, column], one), full)))
+            planes[i, 0], planes[i, 1], planes[i, 2] = x, y, z
+            planes[i, 3] = x * points[0, row, column] + y * points[1, row, column] + z * points[2, row, column]
+    colors[:, 3] = 1
+    return planes, weights, colors
 
 
 def _halves(array: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
@@ -183,6 +200,33 @@ def _merge(values: np.ndarray, valid: np.ndarray, size: int) -> np.ndarray:
         starts = np.arange(0, valid.shape[axis], size)
         total, count = (np.add.reduceat(a, starts, axis) for a in (total, count))
     return total / np.maximum(count, 1)
+
+
+@compiled
+def _look_up(cells, scale, origins, offsets):
+    # Choices instead of min and max, and the table in a loop of its own: so the first is done eight at a time.
+    count, places, size = offsets.shape[1], cells.reshape(-1), np.int32(len(cells))
+    half, last, zero = np.float32(size / 2), np.float32(size - 1), np.float32(0)
+    pixels = np.empty((len(origins), count), np.int32)
+    for i in range(len(origins)):
+        a, b, c = origins[i, 0], origins[i, 1], origins[i, 2]
+        out = pixels[i]
+        for v in range(count):
+            x, y, z = a + offsets[0, v], b + offsets[1, v], c + offsets[2, v]
+            length = np.sqrt(x * x + y * y + z * z)
+            # A little aside, so that straight behind is far out instead of in the middle.
+            aside = length * np.float32(1e-5)
+            least = np.float32(0.1) * aside + np.float32(1e-30)
+            s = scale / (length + z if length + z > least else least)
+            column, row = (x + aside) * s + half, (y + aside) * s + half
+            column = column if column > zero else zero
+            column = column if column < last else last
+            row = row if row > zero else zero
+            row = row if row < last else last
+            out[v] = np.int32(row) * size + np.int32(column)
+        for v in range(count):
+            out[v] = places[out[v]]
+    return pixels
 
 
 @lru_cache(maxsize=8)

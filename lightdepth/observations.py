@@ -74,13 +74,14 @@ def sample_distance(prediction: DepthPrediction, pixels: np.ndarray) -> tuple[np
     x, y = pixels[:, 0] - 0.5, pixels[:, 1] - 0.5
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
     total, weight = np.zeros(len(pixels)), np.zeros(len(pixels))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_distance = np.log(np.where(prediction.valid, prediction.distance, 1.0))
     for dx in (0, 1):
         for dy in (0, 1):
             column, row = np.clip(x0 + dx, 0, width - 1), np.clip(y0 + dy, 0, height - 1)
-            share = (1 - np.abs(x - (x0 + dx))) * (1 - np.abs(y - (y0 + dy))) * prediction.valid[row, column]
-            total += np.where(share > 0, share * log_distance[row, column], 0)
+            known = prediction.valid[row, column]
+            share = (1 - np.abs(x - (x0 + dx))) * (1 - np.abs(y - (y0 + dy))) * known
+            with np.errstate(divide="ignore", invalid="ignore"):
+                log_distance = np.log(np.where(known, prediction.distance[row, column], 1.0))
+                total += np.where(share > 0, share * log_distance, 0)
             weight += share
     valid = weight >= 0.5
     return np.exp(total / np.where(valid, weight, 1.0)), valid

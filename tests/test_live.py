@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.agreement import AgreementConfig
 from densify.contradiction import ContradictionConfig
+from densify.coverage import coverage
 from densify.fusion import FusionConfig
 from densify.live import Densifier
 from densify.packed import packed_view
@@ -70,6 +71,9 @@ def test_a_live_surface_is_the_batch_s():
     for name in ("vertices", "triangles", "colors", "weights", "views"):
         assert np.array_equal(getattr(live, name), getattr(batch, name)), name
     assert len(live.vertices) > 1500 and live.voxel == batch.voxel
+    assert live.contributions == batch.contributions
+    assert coverage(live).record() == coverage(batch).record()
+    assert all(0 < c.views <= len(frames) and c.fused_share > 0.5 for c in live.contributions.values())
     # Rounding is all that is between it and the batch's own.
     exact = densify_submap(submap, sequence(frames), truth, config).dense
     assert abs(len(exact.vertices) / len(live.vertices) - 1) < 0.01

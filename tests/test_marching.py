@@ -1,4 +1,4 @@
-"""Marching cubes by blocks: the surface of the whole volume, renewed only where it changed."""
+"""The surface in patches: that of the whole volume, renewed only where it changed."""
 
 from __future__ import annotations
 
@@ -9,20 +9,16 @@ import pytest
 from colons import colon, slam, truth
 
 from densify.fusion import FusionConfig, TsdfVolume
-from densify.marching import BlockSurface, joined, packed, touched_cells, unpacked
-from densify.marching_cubes import CORNERS
+from densify.marching import BlockSurface, joined
+from densify.marching_cubes import CORNERS, packed, unpacked
 from densify.rectify import RectifyConfig, surface_view
 from lightdepth.camera import Pinhole
 from lightdepth.prediction import DepthPrediction
 
 
-def codes(blocks) -> np.ndarray:
-    return packed(np.array(sorted(blocks), int).reshape(-1, 3))
-
-
 def whole(volume: TsdfVolume) -> BlockSurface:
     surface = BlockSurface()
-    surface.renew(volume, codes(volume.blocks))
+    surface.renew(volume, volume.places)
     return surface
 
 
@@ -76,48 +72,6 @@ def test_no_edge_has_more_than_two_triangles_and_both_turn_alike(fused):
     assert np.unique(np.sort(edges, 1), axis=0, return_counts=True)[1].max() == 2
 
 
-class Noise:
-    """A volume of 2 x 2 x 2 blocks of noise, which holds every case and every meeting of two; before the surface at its
-    border."""
-
-    voxel, capacity = 1.0, 8
-
-    def __init__(self, rng: np.random.Generator):
-        whole = np.ones((16, 16, 16), np.float32)
-        whole[1:15, 1:15, 1:15] = rng.uniform(-1, 1, (14, 14, 14))
-        self.behind = whole < 0
-        self._t = whole.reshape(2, 8, 2, 8, 2, 8).transpose(0, 2, 4, 1, 3, 5).reshape(8, 8, 8, 8)
-        self.keys = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-
-    def slots(self, places: np.ndarray) -> np.ndarray:
-        return np.where(((places >= 0) & (places <= 1)).all(1), places @ (4, 2, 1), -1)
-
-    def sides(self, slots: np.ndarray) -> np.ndarray:
-        return np.full(len(slots), 3, np.uint8)
-
-    def values(self, slots: np.ndarray) -> np.ndarray:
-        return self._t[slots]
-
-    def color_sums(self, voxels: np.ndarray) -> np.ndarray:
-        return np.ones((len(voxels), 4))
-
-
-def test_any_signs_whatever_give_a_closed_surface():
-    volume = Noise(np.random.default_rng(1))
-    surface = BlockSurface()
-    surface.renew(volume, packed(volume.keys))
-    vertices, triangles, _ = joined(surface.patches.values())
-    case = sum(
-        volume.behind[x : x + 15, y : y + 15, z : z + 15].astype(int) << bit
-        for bit, (x, y, z) in enumerate(CORNERS.tolist())
-    )
-    assert len(np.unique(case)) == 256 and len(vertices) > 2000
-    edges = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)])
-    there, times = np.unique(edges, axis=0, return_counts=True)
-    back, back_times = np.unique(edges[:, ::-1], axis=0, return_counts=True)
-    assert np.array_equal(there, back) and np.array_equal(times, back_times)
-
-
 def test_a_vertex_is_where_the_distance_is_zero_in_the_colour_between():
     volume = TsdfVolume(0.4, FusionConfig())
     volume.integrate(plane(20.1, color=0.25), np.eye(4))
@@ -137,13 +91,16 @@ def test_where_too_few_have_looked_there_is_no_surface():
     assert len(vertices) > 300 and vertices[:, 0].min() > -0.5
 
 
-def test_keys_are_packed_and_unpacked_below_zero_too():
-    keys = np.array([[0, 0, 0], [-1, 5, -70000], [500000, -500000, 3]])
-    assert np.array_equal(unpacked(packed(keys)), keys)
-    assert len(touched_cells(packed(keys))) == 24
-    assert set(map(tuple, unpacked(touched_cells(packed(keys[:1]))).tolist())) == {
-        (x, y, z) for x in (0, -1) for y in (0, -1) for z in (0, -1)
-    }
+def test_a_patch_is_one_piece_of_memory_for_all_that_it_holds(fused):
+    for patch in whole(fused).patches.values():
+        assert len(patch.data) - (23 * patch.n + 6 * patch.m) in range(8)
+        assert [len(a) for a in (patch.vertices, patch.colors, patch.edges, patch.triangles)] == [patch.n] * 3 + [
+            patch.m
+        ]
+        assert patch.triangles.max() == patch.n - 1 and patch.m > 0 and len(np.unique(patch.edges)) == patch.n
+        place = unpacked(patch.edges // 3)
+        off = patch.vertices / fused.voxel - place
+        assert off.min() > -1e-2 and off.max() < 1.01
 
 
 def equal(one: BlockSurface, other: BlockSurface) -> bool:
@@ -157,20 +114,34 @@ def equal(one: BlockSurface, other: BlockSurface) -> bool:
 def test_a_surface_renewed_view_by_view_is_the_one_made_at_once():
     volume, surface = TsdfVolume(views()[1], FusionConfig()), BlockSurface()
     for view, pose in views()[0]:
-        surface.renew(volume, codes(volume.integrate(view, pose)))
+        surface.renew(volume, volume.integrate(view, pose))
         assert equal(surface, whole(volume))
     for view, pose in views()[0]:
-        surface.renew(volume, codes(volume.remove(view, pose)))
+        surface.renew(volume, volume.remove(view, pose))
         assert equal(surface, whole(volume))
-    assert not surface.patches and not volume.blocks
+    assert not surface.patches and not len(volume.places)
 
 
 def test_only_blocks_beside_a_change_are_made_again():
     volume, surface = TsdfVolume(0.4, FusionConfig()), BlockSurface()
-    surface.renew(volume, codes(volume.integrate(plane(), np.eye(4))))
+    surface.renew(volume, volume.integrate(plane(), np.eye(4)))
     before = dict(surface.patches)
-    changed = codes(volume.integrate(plane(first=105), np.eye(4)))
-    surface.renew(volume, changed)
+    surface.renew(volume, volume.integrate(plane(first=105), np.eye(4)))
     touched = {code for code in before if before[code] is not surface.patches.get(code)}
-    assert touched and touched <= set(touched_cells(changed).tolist()) == set(surface.renewed.tolist())
+    assert touched and touched <= set(surface.renewed.tolist())
     assert len(touched) < 0.5 * len(before)
+
+
+def test_the_blocks_below_a_change_are_among_those_that_may_have_changed():
+    volume = TsdfVolume(0.4, FusionConfig())
+    volume.integrate(plane(), np.eye(4))
+    before = {code: sums(volume, code) for code in volume.places.tolist()}
+    told = set(volume.integrate(plane(first=105), np.eye(4)).tolist())
+    after = {code: sums(volume, code) for code in volume.places.tolist()}
+    changed = [code for code in after if not np.array_equal(before.get(code), after[code])]
+    below = packed((unpacked(np.array(changed))[:, None] - CORNERS).reshape(-1, 3))
+    assert changed and told >= set(below.tolist()) & after.keys() and len(told) < 0.5 * len(after)
+
+
+def sums(volume: TsdfVolume, code: int) -> np.ndarray:
+    return volume._distance[volume.slots(np.array([code]))[0]].copy()

@@ -105,7 +105,8 @@ def test_what_cannot_be_measured_says_why():
     with pytest.raises(InputError, match=r"is 5 from the surface.*the nearest place on it is"):
         on_wall(w, np.array([[0, 0, 5.0]]))
     with pytest.raises(InputError, match="3 corners lie on a line"):
-        patch(wall("plane"), on_wall(wall("plane"), wall("plane").vertices[[50, 50, len(w.vertices) // 2]]))
+        ends = np.array([[x, y, 0.3 * x - 0.2 * y + 12 * np.sqrt(1.13)] for x, y in ((-3, 2), (-3, 2), (4, -1))])
+        patch(wall("plane"), on_wall(wall("plane"), ends))
     apart = Wall(
         np.concatenate([w.vertices, w.vertices + 100]), np.concatenate([w.triangles, w.triangles + len(w.vertices)])
     )

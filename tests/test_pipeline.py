@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -242,7 +243,9 @@ def test_predictions_that_are_no_distance_make_no_scale(wrong):
         right = truth(frame)
         return right if frame.number != 3 else replace(right, distance=np.full_like(right.distance, wrong))
 
-    result, _ = result_of(frames, model=broken)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        result, _ = result_of(frames, model=broken)
     assert list(reasons(result)) == ["000003.png"] and len(result.dense.triangles) > 1000
 
 

@@ -121,6 +121,7 @@ def test_the_verb_writes_surfaces_timings_and_what_they_say(data, tmp_path, caps
     record = json.loads((run / "run.json").read_text())
     assert record["timings"]["share_in_budget"] == 1 and record["timings"]["keyframes"] == 7
     assert set(record["timings"]["steps"]) == {"read", *STEPS}
+    assert all(0 <= m["coverage"]["well_share"] <= 1 < m["coverage"]["area"] for m in record["maps"])
     assert "100% of 7 keyframes within 1e+06 ms" in capsys.readouterr().out
 
 

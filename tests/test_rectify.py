@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scenes import Scene, cylinder, slanted_plane, sphere
 
-from densify.rectify import FULL, RectifyConfig, SurfaceView, light_weight, surface_view
+from densify.rectify import FULL, DirectionTable, RectifyConfig, SurfaceView, light_weight, surface_view
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.prediction import DepthPrediction
 from lightdepth.tube import lens
@@ -30,6 +30,10 @@ def view_of(prediction: DepthPrediction, config: RectifyConfig = RectifyConfig()
 
 def weights(view: SurfaceView, camera: CameraModel) -> np.ndarray:
     return view.weights[:-1].reshape(camera.height, camera.width)
+
+
+def pixels_of(table: DirectionTable, rays: np.ndarray) -> np.ndarray:
+    return table.look_up(rays.astype(np.float32), np.zeros((3, 1), np.float32))[:, 0]
 
 
 @cache
@@ -57,7 +61,7 @@ def test_every_valid_pixel_of_any_lens_enters_the_fusion_once(camera):
 def test_a_direction_finds_its_pixel_or_the_one_beside_it_up_to_the_rim(camera):
     """A cell is half a pixel wide: so nowhere is a direction further off than half a pixel and half a cell."""
     rays, pixel = directions(camera)
-    found = view_of(sphere(camera).prediction()).table.look_up(*rays.T.astype(np.float32))
+    found = pixels_of(view_of(sphere(camera).prediction()).table, rays)
     inside = found != camera.width * camera.height
     assert inside.mean() > 0.995  # but for half a cell around the image
     off = np.abs(np.stack(np.divmod(found[inside], camera.width)) - np.divmod(pixel[inside], camera.width))
@@ -68,7 +72,7 @@ def test_a_direction_finds_its_pixel_or_the_one_beside_it_up_to_the_rim(camera):
 def test_a_direction_outside_the_image_finds_nothing(camera):
     view = view_of(sphere(camera).prediction())
     outside = np.array([[0, 0, -1.0], [0.1, 0, -1], [1, 1, -0.1], [-1, 0.5, -0.2]])
-    assert (view.table.look_up(*outside.T.astype(np.float32)) == view.table.outside).all()
+    assert (pixels_of(view.table, outside) == view.table.outside).all()
     assert view.weights[view.table.outside] == 0
 
 
@@ -91,7 +95,7 @@ def test_rays_beyond_90_degrees_have_their_pixels():
     rays = camera.unproject(np.stack([np.arange(60) + 0.5, np.full(60, 0.5)], -1))[0]
     found = view_of(DepthPrediction("1", np.ones((1, 60), np.float32), np.ones((1, 60), bool), camera, "wide")).table
     assert rays[:, 2].min() < -0.45
-    np.testing.assert_array_equal(found.look_up(*rays.T.astype(np.float32)), np.arange(60))
+    np.testing.assert_array_equal(pixels_of(found, rays), np.arange(60))
 
 
 @LENSES
