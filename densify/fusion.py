@@ -168,8 +168,11 @@ class TsdfVolume:
         more = max(256, held // 2, wanted)
         for name in ("_codes", "_above", "_below", "_behind", "_known", "_weight", "_distance", "_seen", "_color"):
             array = getattr(self, name)
-            fill = -1 if name in ("_above", "_below") else 0
-            setattr(self, name, np.concatenate([array, np.full((more, *array.shape[1:]), fill, array.dtype)]))
+            longer = np.zeros((held + more, *array.shape[1:]), array.dtype)
+            longer[:held] = array
+            if name in ("_above", "_below"):
+                longer[held:] = -1
+            setattr(self, name, longer)
         self._free += range(held + more - 1, held - 1, -1)
 
     def slots(self, codes: np.ndarray) -> np.ndarray:

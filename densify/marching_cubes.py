@@ -118,9 +118,7 @@ class Cut(NamedTuple):
     @property
     def positions(self) -> np.ndarray:
         """(v, 3) in voxels."""
-        positions = unpacked(self.names // 3).astype(np.float64)
-        positions[np.arange(len(self.names)), self.names % 3] += self.share
-        return positions
+        return _positions(self.names, self.share)
 
 
 def cut(
@@ -245,6 +243,18 @@ def _place_vertices(distance, weight, around, code, edges, names, near, far, sha
         two = around[x >> 3 | y >> 3 << 1 | z >> 3 << 2] * 512 + ((x & 7) << 6 | (y & 7) << 3 | z & 7)
         here, there = t_sums[one] / w_sums[one], t_sums[two] / w_sums[two]
         near[i], far[i], share[i] = one, two, here / (here - there)
+
+
+@compiled
+def _positions(names, share):
+    positions, mask = np.empty((len(names), 3), np.float64), (1 << _BITS) - 1
+    for i in range(len(names)):
+        place, axis = names[i] // 3, names[i] % 3
+        positions[i, 0] = (place >> 2 * _BITS) - REACH
+        positions[i, 1] = (place >> _BITS & mask) - REACH
+        positions[i, 2] = (place & mask) - REACH
+        positions[i, axis] += share[i]
+    return positions
 
 
 @compiled

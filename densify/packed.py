@@ -74,7 +74,7 @@ def packed_view(prediction: DepthPrediction, image: np.ndarray) -> tuple[PackedV
     sigma = uncertainty = None
     if prediction.uncertainty is not None:
         uncertainty, (sigma, _) = _packed(prediction.uncertainty, valid & (prediction.uncertainty > 0), _FEW_STEPS)
-    pixels = np.rint(255 * np.clip(np.nan_to_num(image), 0, 1)).astype(np.uint8)
+    pixels = cv2.convertScaleAbs(np.maximum(image, 0), alpha=255)
     jpeg = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[
         1
     ].tobytes()
