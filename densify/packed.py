@@ -1,8 +1,9 @@
 """A keyframe's depth and image in a tenth of their memory, for surfaces that may have to be made again.
 
 Distance is kept in 65534 steps of its logarithm between the least and the greatest valid value, to some 3e-5 where it
-spans a factor of a hundred; uncertainty in 254, to 1 %. The image is kept as JPEG. A 320x256 keyframe takes some 140 kB
-instead of 1.6 MB, points included. What is fused is what is kept, rounding included: so it can be taken out exactly.
+spans a factor of a hundred; uncertainty in 254, to 1 %; both in a Golomb code. The image is kept as JPEG. A 320x256
+keyframe takes some 140 kB instead of 1.6 MB, points included. What is fused is what is kept, rounding included: so it
+can be taken out exactly.
 """
 
 from __future__ import annotations
