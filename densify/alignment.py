@@ -10,6 +10,7 @@ Notation: a mapped, b predicted distance of a point; s the scale; the ratios a /
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -19,11 +20,14 @@ from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
 from lightdepth.robust import Loss, inlier_sigma, lmeds_scale, refine_scale
 
+Estimator = Literal["lmeds", "median"]
+
 
 @dataclass(frozen=True)
 class AlignmentConfig:
     """When a keyframe's scale is found, and when it is trusted."""
 
+    estimator: Estimator = "lmeds"  # of the scale; median: of the ratios, never refined, to compare with
     t: float = 2.5  # a residual of at most t sigma makes an inlier
     finite_sample: bool = False  # Rousseeuw's factor 1 + 5 / (n - 1) in sigma
     refine: bool = True  # robust refinement on the inliers
@@ -37,6 +41,10 @@ class AlignmentConfig:
     max_second_mode: float = 0.6  # points that agree on another scale, over those that agree on this one
 
     def __post_init__(self) -> None:
+        if self.estimator not in get_args(Estimator):
+            raise InputError(
+                f"alignment.estimator {self.estimator!r}; expected one of {', '.join(get_args(Estimator))}"
+            )
         if not self.t > 0:
             raise InputError(f"alignment.t {self.t}; expected a positive number of sigmas, such as 2.5")
 
@@ -78,13 +86,12 @@ def align(name: str, observed: ObservedDistances, config: AlignmentConfig) -> Al
     if n < config.min_points:
         return Alignment(name, points=n, reason=f"{n} observed points with a prediction; at least {config.min_points}")
     a, b = observed.mapped, observed.predicted
-    best = lmeds_scale(a, b)
-    sigma = inlier_sigma(best.median, n, config.finite_sample)
-    scale = best.scale
+    scale, median = _first_scale(a, b, config.estimator)
+    sigma = inlier_sigma(median, n, config.finite_sample)
     # Data without noise leave a median of rounding errors: do not call their own inliers outliers.
     threshold = config.t * sigma + 1e-9 * float(np.median(a))
     inlier = np.abs(a - scale * b) <= threshold
-    if config.refine:
+    if config.refine and config.estimator == "lmeds":
         scale = refine_scale(a[inlier], b[inlier], scale, max(sigma, 1e-12), loss=config.loss)
     found = Alignment(
         name,
@@ -96,6 +103,15 @@ def align(name: str, observed: ObservedDistances, config: AlignmentConfig) -> Al
         range_90=float(np.quantile(a[inlier], 0.9)) if inlier.any() else 0.0,
     )
     return replace(found, reason=distrust(found, observed, inlier, config))
+
+
+def _first_scale(mapped: np.ndarray, predicted: np.ndarray, estimator: Estimator) -> tuple[float, float]:
+    """A scale that leaves wrong points for the inlier test to find, and the median |residual| that it leaves."""
+    if estimator == "lmeds":
+        best = lmeds_scale(mapped, predicted)
+        return best.scale, best.median
+    scale = float(np.median(mapped / predicted))
+    return scale, float(np.median(np.abs(mapped - scale * predicted)))
 
 
 def bent(alignment: Alignment, bend: Bend, observed: ObservedDistances, config: AlignmentConfig) -> Alignment:

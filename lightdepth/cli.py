@@ -32,9 +32,10 @@ ORDER = (
     "densify",
     "live",
     "evaluate",
+    "bench",
     "measure",
 )
-FILES = ("calibrate-light", "convert-camera", "select", "measure")
+FILES = ("calibrate-light", "convert-camera", "select", "measure", "bench compare")
 """Verbs that write a file; the others make a folder."""
 
 
@@ -62,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
         function = commands[verb].load()
         if list(inspect.signature(function).parameters) == ["argv"]:
             return function(rest) or 0
-        return function(**_parse(function, verb, rest)) or 0
+        return function(**parse(function, verb, rest)) or 0
     except InputError as error:
         print(f"lightdepth {verb}: {error}", file=sys.stderr)
         return 3
@@ -74,7 +75,8 @@ def main(argv: list[str] | None = None) -> int:
         return 130
 
 
-def _parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
+def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
+    """The arguments of a verb's function by name, from the command line's words."""
     import jsonargparse
 
     # The first line only: jsonargparse shows the rest of the docstring beside the options.

@@ -14,7 +14,7 @@ from scenes import cylinder
 import train.ablation as ablation
 from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import save_model
-from lightdepth.cli import _parse
+from lightdepth.cli import parse
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.frame import to_batch
 from lightdepth.losses import LossConfig
@@ -191,7 +191,7 @@ def test_what_cannot_be_used_is_said_before_anything_is_trained(changes, said, t
 def test_every_shipped_ablation_has_rows_that_train_takes(path, tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     assert path.read_text().startswith("# ")
-    given = _parse(ablate, "ablate", ["--config", str(path), "-o", str(tmp_path)])
+    given = parse(ablate, "ablate", ["--config", str(path), "-o", str(tmp_path)])
     parser = training_parser()
     parser.exit_on_error = False
     names = ("base", "settings", "rows", "judged", "seeds")

@@ -1,0 +1,175 @@
+"""The verb bench: a run of the benchmark, `bench compare A B`, `bench estimators`. Thin: arguments in, files out."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from densify.agreement import AgreementConfig
+from densify.alignment import AlignmentConfig
+from densify.bench.estimators import (
+    NO_LIBRARY,
+    EstimatorsConfig,
+    compared_estimators,
+    estimators_picture,
+    estimators_tables,
+    losses,
+)
+from densify.bench.record import notes, read_bench, record, tables
+from densify.bench.scenes import Size, scenes
+from densify.bench.verdict import compare
+from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, Recipe, load_models, predicted, run_scene
+from densify.bending import BendingConfig
+from densify.contradiction import ContradictionConfig
+from densify.fusion import FusionConfig
+from densify.pipeline import DensifyConfig
+from densify.rectify import RectifyConfig
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT
+from lightdepth.cli import parse
+from lightdepth.progress import Progress
+from lightdepth.run import Run, git_revision, plain, run_folder, versions
+
+
+def bench(argv: list[str]) -> int:
+    """The built-in benchmark on synthetic colons; `bench compare A B`; `bench estimators`."""
+    of: dict[str, Callable[..., None]] = {"compare": compare_runs, "estimators": compare_estimators}
+    if argv and argv[0] in of:
+        of[argv[0]](**parse(of[argv[0]], f"bench {argv[0]}", argv[1:]))
+    else:
+        run(**parse(run, "bench", argv))
+    return 0
+
+
+def run(
+    output: Path = Path("runs/bench"),
+    size: Size = "small",
+    first_seed: int = 400,
+    wrong_shares: tuple[float, ...] | None = None,
+    checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT),
+    recipes: tuple[Recipe, ...] = ("paper", "full"),
+    image_size: tuple[int, int] | None = None,
+    alignment: AlignmentConfig = AlignmentConfig(),
+    agreement: AgreementConfig = AgreementConfig(),
+    bending: BendingConfig = BendingConfig(),
+    contradiction: ContradictionConfig = ContradictionConfig(),
+    rectify: RectifyConfig = RectifyConfig(),
+    fusion: FusionConfig = FusionConfig(),
+    overwrite: bool = False,
+) -> None:
+    """Synthetic colons made from seeds, judged row by row (bench compare A B, bench estimators: --help of each).
+
+    Args:
+        output: folder to make, with bench.json and bench.md
+        size: small, two short sequences, minutes; full, eight and a screening, up to an hour
+        first_seed: of the first scene; the others count on from it. Seeds below 1000 were never trained on
+        wrong_shares: of map points, each a SLAM export of its own; left out, those of the size
+        checkpoints: paths, names of bundled ones, or decline (the closed form) or constant
+        recipes: full, paper, or both
+        image_size: width and height of the keyframes, pixels; left out, that of the size
+        alignment: when a keyframe's scale is found and trusted, for all rows
+        agreement: how the keyframes of a submap are aligned together (full)
+        bending: how depth may bend (full)
+        contradiction: pixels that nearer keyframes contradict (full)
+        rectify: which predicted pixels are fused, and how finely
+        fusion: resolution and reach of the surface
+        overwrite: replace a run made before
+    """
+    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    made = DensifyConfig(
+        alignment, rectify, fusion, withhold=0.0, agreement=agreement, bending=bending, contradiction=contradiction
+    )
+    config = BenchConfig(
+        size,
+        first_seed,
+        wrong_shares or SHARES[size],
+        checkpoints=checkpoints,
+        recipes=recipes,
+        image_size=image_size or IMAGE_SIZE[size],
+        densify=made,
+    )
+    models = load_models(checkpoints)
+    with run_folder(output, "bench", arguments, overwrite) as folder:
+        chosen = scenes(config.size, config.first_seed)
+        rows = len(models) * len(recipes)
+        cells: list[dict[str, Any]] = []
+        seconds: dict[str, float] = {}
+        with Progress("Benchmark", sum(rows * len(config.shares(s)) * s.keyframes for s in chosen)) as bar:
+            for scene in chosen:
+                start = time.perf_counter()
+                seen = predicted(scene, config.image_size, models)
+                cells += run_scene(seen, config, partial(bar.advance, scene.keyframes))
+                seconds[scene.name] = round(time.perf_counter() - start, 3)
+        found = record(config, cells, seconds)
+        for cell in cells:
+            for row, figures in cell["rows"].items():
+                if "error" in figures:
+                    folder.fail(f"{cell['scene']}, {cell['wrong_share']:.0%} wrong, {row}", figures["error"])
+        _write_json(folder, "bench.json", found)
+        text = "\n".join([*(t.markdown() for t in tables(found)), *(f"{note}\n" for note in notes(found))])
+        (folder.folder / "bench.md").write_text(text)
+        folder.log(text)
+
+
+def compare_runs(a: Path, b: Path, output: Path | None = None, seed: int = 0) -> None:
+    """Whether run B is better or worse than run A, or within noise; paired where the scenes are the same.
+
+    Args:
+        a: bench.json of the first run, or its folder
+        b: the same of the second
+        output: JSON file to write besides
+        seed: draws the bootstrap
+    """
+    found = compare(read_bench(a), read_bench(b), seed)
+    print(found.markdown(str(a), str(b)))
+    if output is not None:
+        data = {"kind": "bench comparison", "a": a, "b": b, **asdict(found), "verdict": found.verdict}
+        partial = output.with_name(f"{output.name}.partial")
+        partial.write_text(json.dumps(plain(data), indent=1) + "\n")
+        os.replace(partial, output)
+
+
+def compare_estimators(
+    output: Path = Path("runs/estimators"),
+    shares: tuple[float, ...] = EstimatorsConfig.shares,
+    points: tuple[int, ...] = EstimatorsConfig.points,
+    draws: int = 100,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> None:
+    """Estimators of a keyframe's scale side by side, by share, kind and number of wrong points.
+
+    Args:
+        output: folder to make, with estimators.json, .md and .png
+        shares: of wrong points
+        points: per keyframe
+        draws: keyframes for each combination
+        seed: draws them
+        overwrite: replace what an earlier run made there
+    """
+    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    config = EstimatorsConfig(shares=shares, points=points, draws=draws, seed=seed)
+    with run_folder(output, "bench estimators", arguments, overwrite) as folder:
+        with Progress("Estimators", len(config.kinds) * len(points) * len(shares)) as bar:
+            records = compared_estimators(config, bar.advance)
+        said = [*losses(records), NO_LIBRARY]
+        data: dict[str, Any] = {
+            "kind": "estimators",
+            "unit": "shares of 1: |found scale / true scale - 1|",
+            "config": asdict(config),
+        }
+        data |= {"records": records, "notes": said, "versions": versions(), "revision": git_revision()}
+        _write_json(folder, "estimators.json", data)
+        text = "\n".join([*(t.markdown() for t in estimators_tables(records)), *(f"{line}\n" for line in said)])
+        (folder.folder / "estimators.md").write_text(text)
+        (folder.folder / "estimators.png").write_bytes(estimators_picture(records))
+        folder.log(text)
+
+
+def _write_json(run: Run, name: str, data: Mapping[str, Any]) -> None:
+    (run.folder / name).write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n")

@@ -1,0 +1,105 @@
+"""The benchmark's colons: eight short sequences and a screening, shaped like C3VD's in the densification paper.
+
+A scene is as the paper's table 1 has its sequences: so many frames, keyframes and submaps. Only the keyframes are
+rendered: the SLAM is simulated, and nothing else is looked at. The travel is not in the paper ("short, with slow
+motion"; a screening is a whole withdrawal). Lengths in mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from densify.judge import Truth, read_truth
+from lightdepth.datasets import FrameSequence
+from lightdepth.tube import ShapeConfig, Tube, TubeConfig, lens, realistic, render_sequence
+from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
+from lightdepth.tube.variant import VariantTube
+
+SUITE_VERSION = 1
+"""Runs of another version are not comparable: to be raised with every change that makes other scenes of a seed."""
+Size = Literal["small", "full"]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One sequence. `frames` of it were seen by the SLAM, in `maps` submaps, and `keyframes` were kept; `wall` is how
+    the colon is made (of another make than any that a checkpoint was trained on: "other"), `mu` how the light fades
+    to the side (the wider, the smaller), `reflectance` how much of it the walls throw at each other."""
+
+    name: str
+    seed: int
+    frames: int
+    keyframes: int
+    maps: int = 1
+    travel_mm: float = 20.0
+    lens: str = "c3vd"
+    wall: Literal["plain", "realistic", "other"] = "plain"
+    mu: tuple[float, float] = (2.2, 3.4)
+    reflectance: tuple[float, float] = (0.0, 0.7)
+
+    @property
+    def colon(self) -> TubeConfig:
+        made = realistic() if self.wall == "realistic" else TubeConfig()
+        length = max(made.shape.length, self.travel_mm + 120)
+        shape = replace(made.shape, length=length) if self.wall != "other" else ShapeConfig()
+        sensor = replace(made.sensor, mu=self.mu, reflectance=self.reflectance)
+        # A long colon in larger patches: they light each other pairwise.
+        patch = made.patch * max(1.0, np.sqrt(length / 200))
+        return replace(made, shape=shape, sensor=sensor, patch=float(patch))
+
+
+_POINTS = 2000
+"""Of the sparse map of a short sequence, as in the paper's table 2."""
+_WIDE, _STRONG, _WEAK = (0.0, 1.0), (0.5, 0.7), (0.0, 0.2)
+_SHORT = (  # frames and keyframes are t2a's to s3a's of the paper
+    Scene("short1", 0, 194, 16, travel_mm=20, reflectance=_WEAK),
+    Scene("short2", 1, 250, 7, travel_mm=12, wall="other", reflectance=_WEAK),
+    Scene("short3", 2, 382, 14, travel_mm=20, lens="pinhole", wall="realistic"),
+    Scene("short4", 3, 276, 21, travel_mm=25, mu=_WIDE),
+    Scene("short5", 4, 370, 24, travel_mm=25, lens="fisheye", wall="realistic"),
+    Scene("short6", 5, 730, 15, travel_mm=30, reflectance=_STRONG),
+    Scene("short7", 6, 148, 11, travel_mm=15, wall="realistic", mu=_WIDE),
+    Scene("short8", 7, 613, 42, travel_mm=40, wall="other", reflectance=_STRONG),
+)
+_SCREENING = Scene("screening", 8, 5015, 475, maps=19, travel_mm=380, wall="realistic")
+_SMALL = (_SHORT[1], _SHORT[6])
+
+
+def scenes(size: Size, first_seed: int = 400) -> list[Scene]:
+    """The suite of a size, its seeds counted from the first."""
+    chosen = _SMALL if size == "small" else (*_SHORT, _SCREENING)
+    return [replace(scene, seed=first_seed + i) for i, scene in enumerate(chosen)]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """A scene's keyframes with truth, and the wall that they see."""
+
+    scene: Scene
+    frames: FrameSequence
+    truth: Truth
+
+    def slam(self, wrong_share: float) -> SimulatedSlam:
+        """The SLAM's export with a share of wrong points."""
+        new = round(_POINTS / min(self.scene.keyframes, 20))
+        config = SlamConfig(1, self.scene.maps, points_per_keyframe=new, spurious=wrong_share)
+        return simulate_slam(list(self.frames), config, self.scene.seed)
+
+
+def render(scene: Scene, image_size: tuple[int, int]) -> Rendered:
+    """The keyframes of a scene at (width, height), numbered as among all of its frames; a screening is a withdrawal."""
+    kind = VariantTube if scene.wall == "other" else Tube
+    camera = lens(scene.lens, *image_size)
+    made = render_sequence(scene.seed, scene.keyframes, camera, scene.travel_mm, scene.colon, kind=kind).frames
+    if scene.maps > 1:
+        made = made[::-1]
+    numbers = np.linspace(0, scene.frames - 1, scene.keyframes).round().astype(int)
+    named = [replace(f, name=f"{n:06d}", time=n / 50) for f, n in zip(made, numbers.tolist(), strict=True)]
+    sequence = FrameSequence([f.name for f in named], named.__getitem__, f"{scene.name} (seed {scene.seed})")
+    truth = read_truth(sequence)
+    assert truth.surface is not None
+    # The paper's accuracy is to the true cloud. Far points take minutes to find the closest triangle.
+    return Rendered(scene, sequence, replace(truth, surface=replace(truth.surface, mesh=None, mesh_source="")))

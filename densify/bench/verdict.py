@@ -1,0 +1,217 @@
+"""Two runs of the benchmark: is B better than A, worse, or within noise?
+
+Notation: x_j the mean of the log of a figure over the shares of wrong points of scene j; all figures are errors. d_j =
+x_j of B - x_j of A, of the same colon where both runs have the same seeds ("paired"), else of two colons of one design.
+The verdict is on the mean of d over the scenes; exp of it is the ratio B / A.
+
+How much d varies from scene to scene is badly known from two scenes. What it was on other colons counts besides, as if
+it had been seen on `scenes` more (a moderated variance: Smyth 2004):
+
+    s² = (scenes · spread² + sum (d_j - mean d)²) / (scenes + n - 1)
+
+The interval is a smoothed bootstrap's: scenes are drawn with replacement, and a normal deviate tops the variance of a
+draw up to s², itself drawn from what scenes + n - 1 degrees of freedom leave open. Intervals of all rows and figures
+hold together with 95 % (Bonferroni), so that a run compared with its like is "within noise" as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from densify.bench.record import COLUMNS, BenchFile, figure
+from densify.bench.work import INLIERS, SPARSE
+from densify.tables import Table
+from lightdepth.errors import InputError
+
+Verdict = Literal["better", "worse", "within noise"]
+LEVEL = 0.95
+DRAWS = 100_000
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Deviation of d from scene to scene where nothing was changed, by figure, and as how many scenes it counts."""
+
+    scenes: int
+    deviation: Mapping[str, float]
+
+
+SAME_COLONS = Spread(4, {"rms_mm": 0.1, "median_mm": 0.1, "depth_abs_rel": 0.1, "scale_error": 0.5})
+"""Two draws of the SLAM's noise on one colon: what a change that neither helps nor harms may do to a scene."""
+OTHER_COLONS = Spread(20, {"rms_mm": 0.5, "median_mm": 0.5, "depth_abs_rel": 0.4, "scale_error": 0.8})
+"""Two colons of one design. Both by tests/benchmarks/bench_bench.py, on seeds that no figure is reported on."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One figure of one row: geometric means of both runs, the ratio B / A with its interval, from so many scenes;
+    cells (scene and share) that only one of the runs has a figure for."""
+
+    row: str
+    figure: str
+    a: float
+    b: float
+    ratio: float
+    low: float
+    high: float
+    scenes: int
+    only_a: int
+    only_b: int
+
+    @property
+    def verdict(self) -> Verdict:
+        return "worse" if self.low > 1 else "better" if self.high < 1 else "within noise"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All rows that both runs have. `changed` are settings that differ, `unmatched` rows that only one run has."""
+
+    paired: bool
+    judged: tuple[Judged, ...]
+    changed: Mapping[str, tuple[Any, Any]]
+    unmatched: tuple[str, ...]
+    level: float = LEVEL
+
+    def of_row(self, row: str) -> Verdict:
+        return _together([j.verdict for j in self.judged if j.row == row])
+
+    @property
+    def verdict(self) -> Verdict:
+        """Worse if any figure of any row is: a change that harms anything wants looking at, whatever else it helps."""
+        return _together([j.verdict for j in self.judged])
+
+    def markdown(self, a: str, b: str) -> str:
+        rows = [
+            [
+                j.row,
+                COLUMNS[j.figure],
+                j.a,
+                j.b,
+                f"{100 * (j.ratio - 1):+.1f} %",
+                f"{100 * (j.low - 1):+.1f} to {100 * (j.high - 1):+.1f} %",
+                j.verdict,
+            ]
+            for j in self.judged
+        ]
+        headers = ["Row", "Figure", "A", "B", "Difference", f"{self.level:.0%} interval of all", "B is"]
+        how = "same colons, paired differences" if self.paired else "other colons of the same designs, unpaired"
+        n = max(j.scenes for j in self.judged)
+        title = f"A {a}\nB {b}\n\n{n} scenes, {how}. Geometric means over scenes and shares of wrong points."
+        said = [f"{row}: {self.of_row(row)}." for row in dict.fromkeys(j.row for j in self.judged)]
+        said += [f"Setting {k}: {was} in A, {now} in B." for k, (was, now) in self.changed.items()]
+        said += [f"Row {row} is in one run only." for row in self.unmatched]
+        for row in dict.fromkeys(j.row for j in self.judged):
+            first = next(j for j in self.judged if j.row == row)
+            if first.only_a or first.only_b:
+                said.append(
+                    f"{row}: {first.only_a} cells have figures in A alone, {first.only_b} in B alone; they are left "
+                    "out, so look at why."
+                )
+        if n < 5:
+            said.append(f"{n} scenes say little about others: use --size full before you believe a small difference.")
+        made = Table(title, headers, rows).markdown()
+        return f"{made}\n" + "\n".join(said) + f"\n\nB is {self.verdict}" + ("." if "n" in self.verdict else " than A.")
+
+
+def _together(verdicts: Sequence[Verdict]) -> Verdict:
+    return next((v for v in ("worse", "better") if v in verdicts), "within noise")  # type: ignore[return-value]
+
+
+def compare(a: BenchFile, b: BenchFile, seed: int = 0) -> Comparison:
+    """B against A. Raises InputError where they are not of the same work: other suites, scenes, shares or image sizes,
+    seeds that are the same in part, or no row in common."""
+    if a.suite_version != b.suite_version:
+        raise InputError(
+            f"suite version {a.suite_version} in A, {b.suite_version} in B: their scenes differ; run both again with "
+            "one version of the program"
+        )
+    for key in ("size", "image_size", "screening_share"):
+        if a.config.get(key) != b.config.get(key):
+            raise InputError(f"{key} {a.config.get(key)} in A, {b.config.get(key)} in B; run both with the same")
+    places = [{(c.scene, c.wrong_share): c for c in run.cells} for run in (a, b)]
+    if set(places[0]) != set(places[1]):
+        scene, share = sorted(set(places[0]) ^ set(places[1]))[0]
+        which = "A" if (scene, share) in places[0] else "B"
+        raise InputError(f"{scene} at {share:.0%} wrong points is in {which} alone; run both with the same shares")
+    same = [name for name, number in a.seeds.items() if b.seeds[name] == number]
+    if same and len(same) < len(a.seeds):
+        raise InputError(
+            f"{len(same)} of {len(a.seeds)} scenes have the same seed in both runs; expected all (paired) or none"
+        )
+    rows = [list(dict.fromkeys(r for c in run.cells for r in c.rows if r not in (SPARSE, INLIERS))) for run in (a, b)]
+    common = [row for row in rows[0] if row in rows[1]]
+    if not common:
+        raise InputError(f"no row is in both: A has {'; '.join(rows[0])}; B has {'; '.join(rows[1])}")
+    spread = SAME_COLONS if same else OTHER_COLONS
+    tail = (1 - LEVEL) / 2 / (len(common) * len(spread.deviation))
+    judged: list[Judged] = []
+    for row in common:
+        for key in spread.deviation:
+            values = [{place: _log(cell.rows.get(row), key) for place, cell in cells.items()} for cells in places]
+            rng = np.random.default_rng([seed, len(judged)])
+            found = _judge(row, key, values, spread, tail, rng)
+            if found is not None:
+                judged.append(found)
+    if not judged:
+        raise InputError("no row has figures for the same scenes in both runs; their bench.md say why")
+    unmatched = tuple(row for row in dict.fromkeys((*rows[0], *rows[1])) if row not in common)
+    return Comparison(bool(same), tuple(judged), _changed(a.config, b.config), unmatched)
+
+
+_Place = tuple[str, float]
+
+
+def _log(row: Mapping[str, Any] | None, key: str) -> float | None:
+    value = figure(row, key) if row else None
+    return None if value is None else float(np.log(max(value, 1e-9)))
+
+
+def _judge(
+    row: str,
+    key: str,
+    values: Sequence[Mapping[_Place, float | None]],
+    spread: Spread,
+    tail: float,
+    rng: np.random.Generator,
+) -> Judged | None:
+    first, second = ({p: v for p, v in of.items() if v is not None} for of in values)
+    both = [place for place in first if place in second]
+    if not both:
+        return None
+    scenes = list(dict.fromkeys(scene for scene, _ in both))
+    of_scene = [[p for p in both if p[0] == scene] for scene in scenes]
+    x_a = np.array([np.mean([first[p] for p in places]) for places in of_scene])
+    x_b = np.array([np.mean([second[p] for p in places]) for places in of_scene])
+    draws = bootstrapped_mean(x_b - x_a, spread.deviation[key], spread.scenes, rng)
+    low, high = np.exp(np.quantile(draws, [tail, 1 - tail]))
+    a, b = float(np.exp(x_a.mean())), float(np.exp(x_b.mean()))
+    alone = len(first) - len(both), len(second) - len(both)
+    return Judged(row, key, a, b, b / a, float(low), float(high), len(scenes), *alone)
+
+
+def bootstrapped_mean(
+    d: np.ndarray, spread: float, weight: int, rng: np.random.Generator, draws: int = DRAWS
+) -> np.ndarray:
+    """Draws (draws,) of the mean of d (n,) over scenes, as the module's docstring has it."""
+    n, freedom = len(d), weight + len(d) - 1
+    moderated = (weight * spread**2 + ((d - d.mean()) ** 2).sum()) / freedom
+    drawn = d[rng.integers(n, size=(draws, n))].mean(1)
+    missing = moderated * freedom / rng.chisquare(freedom, draws) - d.var()
+    return drawn + np.sqrt(np.maximum(missing, 0) / n) * rng.standard_normal(draws)
+
+
+def _changed(a: Mapping[str, Any], b: Mapping[str, Any], above: str = "") -> dict[str, tuple[Any, Any]]:
+    """Settings by dotted name that differ, but for the seeds."""
+    found: dict[str, tuple[Any, Any]] = {}
+    for key in dict.fromkeys((*a, *b)):
+        one, other = a.get(key), b.get(key)
+        if isinstance(one, Mapping) and isinstance(other, Mapping):
+            found |= _changed(one, other, f"{above}{key}.")
+        elif one != other and key != "first_seed":
+            found[above + key] = (one, other)
+    return found

@@ -1,0 +1,167 @@
+"""One scene of the benchmark: what every row makes of it, as `lightdepth evaluate` judges it.
+
+A cell is one scene with one share of wrong points. Its rows are the sparse map, its inliers (those of the last row),
+and a dense map for each model and recipe. Models see each keyframe once; the rows share what they said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from densify.bench.scenes import Rendered, Scene, Size, render
+from densify.dense_map import DenseMap
+from densify.evaluation import compare_depth
+from densify.judge import Model, judge_maps
+from densify.pipeline import DensifyConfig, densify
+from densify.trajectory import align_trajectory, keyframe_trajectory
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame
+from lightdepth.predict import DepthModel
+from lightdepth.prediction import DepthPrediction
+from lightdepth.sparse_map import Submap
+
+Recipe = Literal["paper", "full"]
+SPARSE, INLIERS = "sparse map", "sparse inliers"
+SHARES: dict[Size, tuple[float, ...]] = {"small": (0.1, 0.45), "full": (0.0, 0.1, 0.3, 0.45)}
+IMAGE_SIZE: dict[Size, tuple[int, int]] = {"small": (160, 128), "full": (320, 256)}
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """What is measured. `densify` holds for all dense rows but for its recipe; the screening, ten times as long as the
+    others, is judged at one share of wrong points only."""
+
+    size: Size = "small"
+    first_seed: int = 400
+    wrong_shares: tuple[float, ...] = SHARES["small"]
+    screening_share: float = 0.3
+    checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT)
+    recipes: tuple[Recipe, ...] = ("paper", "full")
+    image_size: tuple[int, int] = IMAGE_SIZE["small"]
+    densify: DensifyConfig = field(default_factory=lambda: DensifyConfig(withhold=0.0))
+
+    def __post_init__(self) -> None:
+        for name in ("wrong_shares", "checkpoints", "recipes"):
+            given = getattr(self, name)
+            if not given or len(set(given)) < len(given):
+                raise InputError(f"{name} {list(given)}; expected at least one, and none twice")
+        if not all(0 <= share < 1 for share in (*self.wrong_shares, self.screening_share)):
+            raise InputError(f"wrong_shares {list(self.wrong_shares)}; expected shares of at least 0 and below 1")
+        if min(self.image_size) < 32:
+            raise InputError(f"image_size {list(self.image_size)}; expected at least 32 pixels each way")
+        if self.first_seed < 0:
+            raise InputError(f"first_seed {self.first_seed}; expected 0 or more")
+
+    def shares(self, scene: Scene) -> tuple[float, ...]:
+        return self.wrong_shares if scene.maps == 1 else (self.screening_share,)
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """A rendered scene with what each model says of its keyframes, by model and frame."""
+
+    rendered: Rendered
+    predictions: Mapping[str, Mapping[str, DepthPrediction]]
+
+
+def predicted(scene: Scene, image_size: tuple[int, int], models: Sequence[DepthModel]) -> Predicted:
+    rendered = render(scene, image_size)
+    return Predicted(rendered, {m.name: {f.name: m(f) for f in rendered.frames} for m in models})
+
+
+def load_models(checkpoints: Sequence[str]) -> list[DepthModel]:
+    """The models that the rows are named after. Raises InputError where two have one name."""
+    models = [load_model(checkpoint, details=False) for checkpoint in checkpoints]
+    names = [model.name for model in models]
+    twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
+    if twice is not None:
+        raise InputError(f"two checkpoints are called {twice}; rows are named after them: rename one of the files")
+    return models
+
+
+def run_scene(scene: Predicted, config: BenchConfig, on_row: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
+    """The cells of a scene, one for each share of wrong points. A row that cannot be judged says why."""
+    return [_cell(scene, share, config, on_row) for share in config.shares(scene.rendered.scene)]
+
+
+def _cell(scene: Predicted, share: float, config: BenchConfig, on_row: Callable[[], None]) -> dict[str, Any]:
+    rendered = scene.rendered
+    sparse_map = rendered.slam(share).map
+    bare = judge_maps([_model(s, sparse=s.points) for s in sparse_map.submaps], rendered.truth).result
+    rows: dict[str, Any] = {}
+    inliers: list[Model] = []
+    for model, known in scene.predictions.items():
+        for recipe in config.recipes:
+            chosen = replace(config.densify, recipe=recipe)
+            made = [r.dense for r in densify(rendered.frames, sparse_map, partial(_known, known), chosen)]
+            rows[f"{model}, {recipe}"] = _dense_row(made, rendered, known)
+            inliers = [_model(m.submap, sparse_inliers=m.submap.points[m.judged_points()[1]]) for m in made]
+            on_row()
+    return {
+        "scene": rendered.scene.name,
+        "seed": rendered.scene.seed,
+        "wrong_share": share,
+        "frames": rendered.scene.frames,
+        "trajectory": {name: bare["trajectory"][name] for name in ("keyframes", "submaps", "submaps_aligned")}
+        | {"rms_ate_mm": bare["trajectory"]["rms_ate_mm"]},
+        "rows": {SPARSE: _surface(bare, "sparse"), INLIERS: _judged(inliers, rendered, "sparse_inliers"), **rows},
+    }
+
+
+def _known(predictions: Mapping[str, DepthPrediction], frame: Frame) -> DepthPrediction:
+    return predictions[frame.name]
+
+
+def _model(submap: Submap, **clouds: np.ndarray) -> Model:
+    return Model(keyframe_trajectory(submap), clouds)
+
+
+def _judged(models: Sequence[Model], rendered: Rendered, cloud: str) -> dict[str, Any]:
+    try:
+        return _surface(judge_maps(models, rendered.truth).result, cloud)
+    except InputError as error:
+        return {"error": str(error)}
+
+
+def _surface(result: Mapping[str, Any], cloud: str) -> dict[str, Any]:
+    found = result["all"].get(cloud)
+    return found or {"error": "no map has a surface that can be compared"}
+
+
+def _dense_row(made: Sequence[DenseMap], rendered: Rendered, known: Mapping[str, DepthPrediction]) -> dict[str, Any]:
+    """The surface's figures, and the mean over the aligned keyframes of their depth's, in the scale of the map."""
+    depths = [d for m in made for d in _depths(m, rendered, known)]
+    found = _judged([_model(m.submap, dense=m.vertices) for m in made], rendered, "dense")
+    keyframes = sum(len(m.alignments) for m in made)
+    counts = {"keyframes": keyframes, "keyframes_aligned": sum(len(m.aligned) for m in made)}
+    if "error" in found or not depths:
+        reasons = [a.reason for m in made for a in m.alignments if not a.ok]
+        why = f"no keyframe was aligned; the first: {reasons[0]}" if not counts["keyframes_aligned"] else found["error"]
+        return {"error": why, **counts}
+    return {**found, **{name: float(np.mean([d[name] for d in depths])) for name in depths[0]}, **counts}
+
+
+def _depths(made: DenseMap, rendered: Rendered, known: Mapping[str, DepthPrediction]) -> list[dict[str, float]]:
+    """Of each aligned keyframe of a submap, its depth brought to mm by the submap's Sim(3) alone: AbsRel, RMSE, and
+    the error of its scale, |median p / q - 1|."""
+    try:
+        mm = align_trajectory(keyframe_trajectory(made.submap), rendered.truth.poses).true_from_map.scale
+    except InputError:
+        return []
+    found = []
+    for keyframe, alignment in zip(made.submap.keyframes, made.alignments, strict=True):
+        frame = rendered.frames.by_number(keyframe.number)
+        assert frame is not None
+        if alignment.ok:
+            depth = compare_depth(alignment.applied(known[frame.name]).scaled(mm), frame)
+            errors = depth.errors(["none"])
+            ratio = np.median(depth.predicted[depth.valid] / depth.truth[depth.valid])
+            row = {"depth_abs_rel": errors["abs_rel_none"], "depth_rmse_mm": errors["rmse_mm_none"]}
+            found.append({**row, "scale_error": abs(float(ratio) - 1)})
+    return found
