@@ -7,6 +7,7 @@ and a dense map for each model and recipe. Models see each keyframe once; the ro
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -15,7 +16,7 @@ import numpy as np
 
 from densify.bench.scenes import Rendered, Scene, Size, render
 from densify.dense_map import DenseMap
-from densify.evaluation import compare_depth
+from densify.evaluation import compare_depth, rms
 from densify.judge import Model, judge_maps
 from densify.pipeline import DensifyConfig, densify
 from densify.trajectory import align_trajectory, keyframe_trajectory
@@ -93,7 +94,7 @@ def run_scene(scene: Predicted, config: BenchConfig, on_row: Callable[[], None] 
 def _cell(scene: Predicted, share: float, config: BenchConfig, on_row: Callable[[], None]) -> dict[str, Any]:
     rendered = scene.rendered
     sparse_map = rendered.slam(share).map
-    bare = judge_maps([_model(s, sparse=s.points) for s in sparse_map.submaps], rendered.truth).result
+    sparse = [_model(s, sparse=s.points) for s in sparse_map.submaps]
     rows: dict[str, Any] = {}
     inliers: list[Model] = []
     for model, known in scene.predictions.items():
@@ -103,14 +104,14 @@ def _cell(scene: Predicted, share: float, config: BenchConfig, on_row: Callable[
             rows[f"{model}, {recipe}"] = _dense_row(made, rendered, known)
             inliers = [_model(m.submap, sparse_inliers=m.submap.points[m.judged_points()[1]]) for m in made]
             on_row()
+    around = {SPARSE: _judged(sparse, rendered, "sparse"), INLIERS: _judged(inliers, rendered, "sparse_inliers")}
     return {
         "scene": rendered.scene.name,
         "seed": rendered.scene.seed,
         "wrong_share": share,
         "frames": rendered.scene.frames,
-        "trajectory": {name: bare["trajectory"][name] for name in ("keyframes", "submaps", "submaps_aligned")}
-        | {"rms_ate_mm": bare["trajectory"]["rms_ate_mm"]},
-        "rows": {SPARSE: _surface(bare, "sparse"), INLIERS: _judged(inliers, rendered, "sparse_inliers"), **rows},
+        "trajectory": _trajectory(sparse, rendered),
+        "rows": {**around, **rows},
     }
 
 
@@ -122,16 +123,24 @@ def _model(submap: Submap, **clouds: np.ndarray) -> Model:
     return Model(keyframe_trajectory(submap), clouds)
 
 
+def _trajectory(models: Sequence[Model], rendered: Rendered) -> dict[str, Any]:
+    aligned = []
+    for model in models:
+        with suppress(InputError):
+            aligned.append(align_trajectory(model.trajectory, rendered.truth.poses))
+    keyframes = {n for m in models for n in m.trajectory.numbers.tolist()}
+    error = rms(np.concatenate([a.ate_sim3 for a in aligned])) if aligned else None
+    return {"keyframes": len(keyframes), "submaps": len(models), "submaps_aligned": len(aligned), "rms_ate_mm": error}
+
+
 def _judged(models: Sequence[Model], rendered: Rendered, cloud: str) -> dict[str, Any]:
     try:
-        return _surface(judge_maps(models, rendered.truth).result, cloud)
+        result = judge_maps(models, rendered.truth).result
     except InputError as error:
         return {"error": str(error)}
-
-
-def _surface(result: Mapping[str, Any], cloud: str) -> dict[str, Any]:
-    found = result["all"].get(cloud)
-    return found or {"error": "no map has a surface that can be compared"}
+    if cloud not in result["all"]:
+        return {"error": "no map has a surface that can be compared"}
+    return {**result["all"][cloud], "submaps_judged": sum(bool(m.get(cloud)) for m in result["maps"])}
 
 
 def _dense_row(made: Sequence[DenseMap], rendered: Rendered, known: Mapping[str, DepthPrediction]) -> dict[str, Any]:
