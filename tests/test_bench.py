@@ -59,7 +59,9 @@ def test_a_run_compared_with_itself_is_within_noise(made, capsys, tmp_path):
     assert "B is within noise." in capsys.readouterr().out
     found = json.loads((tmp_path / "c.json").read_text())
     assert found["verdict"] == "within noise" and found["paired"] and len(found["judged"]) == 8
-    assert all(j["ratio"] == 1 and j["low"] < 1 < j["high"] for j in found["judged"])
+    for j in found["judged"]:
+        none = 1 if j["change_is"] == "ratio" else 0
+        assert j["change"] == none and j["low"] < none < j["high"]
 
 
 def test_scenes_of_a_seed_are_the_same_and_their_names_are_not_those_of_other_sizes():
@@ -116,7 +118,9 @@ def test_the_verdict_names_the_row_that_changed_and_its_direction(tmp_path):
     assert found.paired and found.verdict == "worse"
     assert found.of_row("net, full") == "worse" and found.of_row("net, paper") == "within noise"
     first = found.judged[0]
-    assert first.ratio == pytest.approx(4) and 1 < first.low < 4 < first.high
+    assert first.change == pytest.approx(4) and 1 < first.low < 4 < first.high
+    scale = next(j for j in found.judged if j.figure == "scale_error")
+    assert (scale.a, scale.b, scale.change) == pytest.approx((0.02, 0.08, 0.06)) and scale.shown()[0] == "+6.0 points"
     assert compared(a, better).verdict == "better" and compared(worse, a).verdict == "better"
 
 
