@@ -20,6 +20,7 @@ from lightdepth.tube import ShapeConfig, TubeConfig
 
 TINY = Scene("tiny", 0, 40, 5, travel_mm=8.0)
 FIGURES = {"rms_mm": 3.0, "median_mm": 1.5, "depth_abs_rel": 0.08, "scale_error": 0.02}
+COUNTS = {"keyframes": 10, "keyframes_aligned": 10}
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +59,7 @@ def test_a_run_compared_with_itself_is_within_noise(made, capsys, tmp_path):
     assert bench(["compare", str(made), str(made / "bench.json"), "-o", str(tmp_path / "c.json")]) == 0
     assert "B is within noise." in capsys.readouterr().out
     found = json.loads((tmp_path / "c.json").read_text())
-    assert found["verdict"] == "within noise" and found["paired"] and len(found["judged"]) == 8
+    assert found["verdict"] == "within noise" and found["paired"] and len(found["judged"]) == 10
     for j in found["judged"]:
         none = 1 if j["change_is"] == "ratio" else 0
         assert j["change"] == none and j["low"] < none < j["high"]
@@ -96,7 +97,9 @@ def written(folder: Path, factor=1.0, first_seed=400, rows=("net, full", "net, p
     cells = []
     for i in range(count):
         shift = float(np.exp(noise * rng.standard_normal()))
-        figures = {row: {k: v * (factor * shift if row == rows[0] else 1) for k, v in FIGURES.items()} for row in rows}
+        figures = {
+            row: {k: v * (factor * shift if row == rows[0] else 1) for k, v in FIGURES.items()} | COUNTS for row in rows
+        }
         for share in (0.1, 0.45):
             cells.append({"scene": f"short{i}", "seed": first_seed + i, "wrong_share": share, "rows": figures})
     config = {"size": "small", "image_size": [160, 128], "screening_share": 0.3, "first_seed": first_seed}
@@ -169,10 +172,21 @@ def test_a_spread_larger_than_expected_widens_the_interval():
 def test_cells_without_figures_are_left_out_and_said(tmp_path):
     a, b = written(tmp_path / "a"), written(tmp_path / "b")
     data = json.loads((b / "bench.json").read_text())
-    data["cells"][0]["rows"]["net, full"] = {"error": "no keyframe was aligned"}
+    data["cells"][0]["rows"]["net, full"] = {"error": "no keyframe was aligned", **COUNTS, "keyframes_aligned": 0}
     (b / "bench.json").write_text(json.dumps(data))
     found = compared(a, b)
     assert found.judged[0].only_a == 1 and "1 cells have figures in A alone" in found.markdown("A", "B")
+
+
+def test_a_row_that_no_longer_aligns_anything_is_worse_though_it_has_no_errors_left(tmp_path):
+    a, b = written(tmp_path / "a"), written(tmp_path / "b")
+    data = json.loads((b / "bench.json").read_text())
+    for cell in data["cells"]:
+        cell["rows"]["net, full"] = {"error": "no keyframe was aligned", **COUNTS, "keyframes_aligned": 0}
+    (b / "bench.json").write_text(json.dumps(data))
+    found = compared(a, b)
+    assert [j.figure for j in found.judged if j.row == "net, full"] == ["unaligned_share"]
+    assert found.of_row("net, full") == found.verdict == "worse" and compared(b, a).verdict == "better"
 
 
 def test_settings_that_differ_are_named(tmp_path):

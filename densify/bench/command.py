@@ -134,7 +134,7 @@ def compare_estimators(
     output: Path = Path("runs/estimators"),
     shares: tuple[float, ...] = EstimatorsConfig.shares,
     points: tuple[int, ...] = EstimatorsConfig.points,
-    draws: int = 100,
+    draws: int = 50,
     seed: int = 0,
     overwrite: bool = False,
 ) -> None:

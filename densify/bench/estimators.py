@@ -51,7 +51,7 @@ class EstimatorsConfig:
     shares: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6)
     kinds: tuple[Kind, ...] = ("uniform", "clustered", "depth")
     points: tuple[int, ...] = (20, 100, 500)
-    draws: int = 100
+    draws: int = 50
     seed: int = 0
 
     def __post_init__(self) -> None:

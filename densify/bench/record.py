@@ -27,11 +27,13 @@ COLUMNS = {
     "completeness_median_mm": "Completeness mm",
     "depth_abs_rel": "Depth AbsRel",
     "scale_error": "Scale error",
+    "unaligned_share": "KF left out",
 }
 UNITS = (
     "mm; shares, depth_abs_rel and scale_error of 1. rms_mm, median_mm, p90_mm: from each model point to the closest "
     "true point; completeness: from each true point to the closest model point; depth_*: of the aligned keyframes' "
-    "depth, mean over keyframes; scale_error: |median of predicted / true depth - 1| of a keyframe, mean over keyframes"
+    "depth, mean over keyframes; scale_error: |median of predicted / true depth - 1| of a keyframe, mean over "
+    "keyframes; keyframes are left out where their alignment is not trusted"
 )
 ALIGNMENT = (
     "Sim(3) of each submap's keyframes to the true ones (least ATE), for surfaces and depth alike; depth is not "
@@ -114,6 +116,8 @@ def figure(row: Mapping[str, Any], key: str) -> float | None:
     """A column's value in a row; None where it has none."""
     if key == "completeness_median_mm":
         return row["completeness"]["median_mm"] if row.get("completeness") else None
+    if key == "unaligned_share":
+        return 1 - row["keyframes_aligned"] / row["keyframes"] if row.get("keyframes") else None
     value = row.get(key)
     return value / 1000 if key == "points" and value is not None else value
 

@@ -5,7 +5,8 @@
 The worse setting is the median of the ratios in place of LMedS (--alignment.estimator median) at 45 % wrong points.
 Sets of seeds are 400-401 (A) and 402-403 (B), and so on to 436-439: forty colons, each rendered and predicted once.
 LIGHTDEPTH_FIRST_SEED takes others: on seeds from 310 on the spreads of densify.bench.verdict were measured, which the
-last test prints (and SLAMs drawn anew are measured below 400 only). LIGHTDEPTH_CELLS keeps what was measured in a file, and goes on from it.
+last test prints (and SLAMs drawn anew are measured below 400 only). LIGHTDEPTH_CELLS keeps what was measured in a
+file, and goes on from it.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ _Cells = dict[str, list[dict[str, Any]]]
 
 
 def _of_colon(first: int, place: int, models: Sequence[Any]) -> _Cells:
-    """Cells of one colon as they are, with the worse setting, and with another draw of the SLAM's noise."""
+    """Cells of one colon as they are, with the worse setting (sets A), and with another draw of the SLAM's noise."""
     scene = predicted(scenes("small", first)[place], CONFIG.image_size, models)
     redrawn = replace(scene.rendered, scene=replace(scene.rendered.scene, seed=scene.rendered.scene.seed + 10_000))
     return {
         "as it is": run_scene(scene, CONFIG),
-        "worse": run_scene(scene, WORSE),
+        "worse": run_scene(scene, WORSE) if (first - FIRST) % 4 == 0 else [],
         "redrawn": run_scene(Predicted(redrawn, scene.predictions), CONFIG) if FIRST < 400 else [],
     }
 
@@ -107,7 +108,7 @@ def test_two_disjoint_sets_of_seeds_are_within_noise_of_each_other(sets):
 @pytest.mark.parametrize("other", [0, 1], ids=["the same seeds", "disjoint seeds"])
 def test_the_median_in_place_of_lmeds_is_worse(sets, other):
     heavy = replace(CONFIG, wrong_shares=(HEAVY,))
-    pairs = [(sets[i], sets[i + other]) for i in range(0, 2 * TIMES, 2)]
+    pairs = [(sets[i + other], sets[i]) for i in range(0, 2 * TIMES, 2)]
     found = [compare(_run(heavy, a["as it is"]), _run(WORSE, b["worse"])) for a, b in pairs]
     _shown(f"the worse setting, {'disjoint' if other else 'the same'} seeds", found)
     assert all(c.paired != bool(other) for c in found)
