@@ -189,3 +189,13 @@ def test_a_bend_is_judged_like_a_scale():
     assert np.isin(same.outlier_ids, pairs.point_ids[280:]).mean() > 0.8
     tilted = replace(flat, weights=np.array([np.log(0.3), 1.5, 0, 0, 0, 0]))
     assert not bent(before, tilted, pairs, AlignmentConfig()).ok
+
+
+def test_the_median_of_the_ratios_is_taken_as_it_is_and_wrong_points_pull_it():
+    pairs = observed(wrong=0.45, seed=3)
+    found = align("1", pairs, AlignmentConfig(estimator="median"))
+    lmeds = align("1", pairs, AlignmentConfig())
+    assert found.scale == np.median(pairs.mapped / pairs.predicted)
+    assert found.scale > lmeds.scale * 1.005 and found.sigma > lmeds.sigma
+    with pytest.raises(InputError, match="alignment.estimator 'mean'; expected one of lmeds, median"):
+        AlignmentConfig(estimator="mean")

@@ -252,5 +252,14 @@ def test_a_figure_that_is_no_distance_is_refused_with_its_place(tmp_path, value)
         read_bench(tmp_path / "a")
 
 
+@pytest.mark.parametrize("change", [("depth_abs_rel", "0.08", "NaN"), ("keyframes_aligned", "10", "-1")])
+def test_shares_and_counts_must_be_numbers_too(tmp_path, change):
+    key, was, now = change
+    text = (written(tmp_path / "a") / "bench.json").read_text().replace(f'"{key}": {was}', f'"{key}": {now}', 1)
+    (tmp_path / "a" / "bench.json").write_text(text)
+    with pytest.raises(InputError, match=f"{key} is .*expected a number of at least 0"):
+        read_bench(tmp_path / "a")
+
+
 def test_the_spreads_know_the_same_figures():
     assert set(verdict.SAME_COLONS.deviation) == set(verdict.OTHER_COLONS.deviation) <= set(COLUMNS)

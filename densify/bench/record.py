@@ -44,7 +44,7 @@ MASK = (
     "are valid, below 100 mm"
 )
 
-_Number = Annotated[float, Field(allow_inf_nan=False)]
+_ALSO_COMPARED = ("depth_abs_rel", "scale_error", "keyframes", "keyframes_aligned")
 
 
 class Cell(BaseModel):
@@ -100,14 +100,13 @@ def read_bench(path: Path) -> BenchFile:
     found = checked_fields(BenchFile, data, str(path))
     for cell in found.cells:
         for name, row in cell.rows.items():
-            if "error" in row:
-                continue
-            for key in ("rms_mm", "median_mm"):
-                value = row.get(key)
-                if not isinstance(value, (int, float)) or not np.isfinite(value) or value <= 0:
+            needed = () if "error" in row else ("rms_mm", "median_mm")
+            for key in (*needed, *(k for k in _ALSO_COMPARED if k in row)):
+                value, least = row.get(key), 0 if key in _ALSO_COMPARED else 1e-9
+                if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value < np.inf:
                     raise InputError(
                         f"{path}: {cell.scene} at {cell.wrong_share:.0%} wrong points, row {name!r}: {key} is "
-                        f"{value!r}; expected a distance above 0"
+                        f"{value!r}; expected a number {'of at least 0' if least == 0 else 'above 0'}"
                     )
     return found
 
