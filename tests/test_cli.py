@@ -83,7 +83,7 @@ def test_a_mistyped_verb_is_told_which_was_meant(capsys):
     assert lightdepth("cook") == 2 and "expected one of demo, doctor" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("verb", ["demo", "synth", "predict", "sparse", "densify", "live", "evaluate"])
+@pytest.mark.parametrize("verb", ["demo", "synth", "predict", "sparse", "densify", "live", "evaluate", "bench"])
 def test_every_verb_explains_its_options(verb, capsys):
     assert lightdepth(verb, "--help") == 0
     shown = capsys.readouterr().out

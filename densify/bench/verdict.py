@@ -211,9 +211,10 @@ def _judge(
     draws = bootstrapped_mean(x_b - x_a, spread.deviation[key], spread.scenes, rng)
     interval = np.quantile(draws, [tail, 1 - tail])
     means = np.array([x_a.mean(), x_b.mean(), x_b.mean() - x_a.mean(), *interval])
-    figures = [float(v) for v in (means if key in _ADDITIVE else np.exp(means))]
+    a, b, change, low, high = (float(v) for v in (means if key in _ADDITIVE else np.exp(means)))
     alone = len(first) - len(both), len(second) - len(both)
-    return Judged(row, key, "difference" if key in _ADDITIVE else "ratio", *figures, len(scenes), *alone)
+    kind: Literal["ratio", "difference"] = "difference" if key in _ADDITIVE else "ratio"
+    return Judged(row, key, kind, a, b, change, low, high, len(scenes), *alone)
 
 
 def bootstrapped_mean(
