@@ -56,8 +56,9 @@ def sets() -> list[_Cells]:
     models = load_models(CONFIG.checkpoints)
     kept = Path(os.environ["LIGHTDEPTH_CELLS"]) if "LIGHTDEPTH_CELLS" in os.environ else None
     known = json.loads(kept.read_text()) if kept is not None and kept.is_file() else {}
-    found = []
-    for first in range(FIRST, FIRST + 4 * TIMES, 2):
+    found: dict[int, _Cells] = {}
+    firsts = range(FIRST, FIRST + 4 * TIMES, 2)
+    for first in [*firsts[::2], *firsts[1::2]]:
         together: _Cells = {}
         for place in (0, 1):
             key = str(first + place)
@@ -68,8 +69,8 @@ def sets() -> list[_Cells]:
                 print(f"colon {key} done", flush=True)
             for name, cells in known[key].items():
                 together.setdefault(name, []).extend(cells)
-        found.append(together)
-    return found
+        found[first] = together
+    return [found[first] for first in firsts]
 
 
 def _run(config: BenchConfig, cells: Sequence[dict[str, Any]]) -> BenchFile:
