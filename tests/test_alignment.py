@@ -197,5 +197,5 @@ def test_the_median_of_the_ratios_is_taken_as_it_is_and_wrong_points_pull_it():
     lmeds = align("1", pairs, AlignmentConfig())
     assert found.scale == np.median(pairs.mapped / pairs.predicted)
     assert found.scale > lmeds.scale * 1.005 and found.sigma > lmeds.sigma
-    with pytest.raises(InputError, match="alignment.estimator 'mean'; expected one of lmeds, median"):
+    with pytest.raises(InputError, match=r"alignment\.estimator 'mean'; expected one of lmeds, median"):
         AlignmentConfig(estimator="mean")
