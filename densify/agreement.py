@@ -8,9 +8,10 @@ all keyframes minimise together
     + overlap sum_ij sum_X rho((log |X - c_j| - log d_j(p)) / o_ij)     pixels of i that j sees as well
     + sum_i w_i' diag(prior) w_i                                        the ridge of the bending
 
-with Geman-McClure's rho, s_i robust deviations of the residuals at hand (1.4826 median), o_ij that of the overlap, but
-not below s_i and s_j: depth maps agree best when all of them are flat, and must not count for more, the worse they then
-fit the points. Residuals are of the logarithm, because both a network and a triangulation err in proportion to the
+with Geman-McClure's rho; s_i the deviation of the residuals at hand (from their lower quartile), never above what it
+was at the LMedS scale, or wrong points would widen it and be let in; o_ij that of the overlap (1.4826 median), but not
+below that of the points of i or j: depth maps agree best when all are flat, and must not count for more, the worse they
+then fit the points. Residuals are of the logarithm, because both a network and a triangulation err in proportion to the
 distance or faster. Solved by Gauss-Newton on sparse normal equations, with weights and projections renewed in every
 round; nothing in it is random.
 """
@@ -103,12 +104,9 @@ def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, be
     pairs = _pairs(shared, config.neighbours) if config.overlap else []
     places = [_Places(view, bend, config.samples) for view, bend in zip(views, bends, strict=True)]
     w = np.concatenate([bend.weights for bend in bends])
-    for round_ in range(config.rounds):
-        widen = 2.0 ** max(0, 2 - round_)
-        points = [
-            _point_rows(i, view, bend, places[i], widen)
-            for i, (view, bend) in enumerate(zip(views, bends, strict=True))
-        ]
+    most = [_inlier_deviation(_residual(*each)) for each in zip(views, bends, places, strict=True)]
+    for _ in range(config.rounds):
+        points = [_point_rows(i, *each) for i, each in enumerate(zip(views, bends, places, most, strict=True))]
         rows = points + _overlap_rows(views, bends, places, pairs, config, points)
         step = _step(rows, prior, prior * w, len(views))
         if step is None:
@@ -188,11 +186,21 @@ class _Places:
         return rays, log_predicted, self.bend.basis(x, log_predicted)
 
 
-def _point_rows(index: int, view: View, bend: Bend, places: _Places, widen: float) -> _Rows:
-    o, phi = view.observed, places.at_points
-    residual = np.log(o.mapped) - np.log(o.predicted) - phi @ bend.weights
-    sigma = _deviation(residual)
-    return _Rows(residual, _weight(residual / (widen * sigma)) / sigma**2, {index: phi})
+def _residual(view: View, bend: Bend, places: _Places) -> np.ndarray:
+    o = view.observed
+    return np.log(o.mapped) - np.log(o.predicted) - places.at_points @ bend.weights
+
+
+def _point_rows(index: int, view: View, bend: Bend, places: _Places, most: float) -> _Rows:
+    residual = _residual(view, bend, places)
+    sigma = min(_inlier_deviation(residual), most)
+    return _Rows(residual, _weight(residual / sigma) / sigma**2, {index: places.at_points})
+
+
+def _inlier_deviation(residual: np.ndarray) -> float:
+    """Standard deviation, where up to half of the residuals are wrong: from the lower quartile, which they inflate
+    less than the median."""
+    return max(float(np.quantile(np.abs(residual), 0.25)) / 0.3186, _LEAST_SIGMA)
 
 
 def _deviation(residual: np.ndarray) -> float:

@@ -115,7 +115,8 @@ def _first_scale(mapped: np.ndarray, predicted: np.ndarray, estimator: Estimator
 
 
 def bent(alignment: Alignment, bend: Bend, observed: ObservedDistances, config: AlignmentConfig) -> Alignment:
-    """The alignment with a bend, and the points judged again: inliers within t sigma of the log residuals."""
+    """The alignment with a bend, and the points judged again: inliers within t sigma of the log residuals. A bend that
+    does not deserve trust is left out, and the alignment stays what it was, one scale."""
     field = bend.at(observed.pixels, observed.predicted)
     residual = np.abs(np.log(observed.mapped / observed.predicted) - field)
     sigma = inlier_sigma(float(np.median(residual)), len(residual), config.finite_sample)
@@ -129,7 +130,7 @@ def bent(alignment: Alignment, bend: Bend, observed: ObservedDistances, config: 
         bend=bend,
     )
     judged = replace(found, scale=1.0), replace(observed, predicted=observed.predicted * np.exp(field))
-    return replace(found, reason=distrust(*judged, inlier, config))
+    return alignment if distrust(*judged, inlier, config) else found
 
 
 def distrust(found: Alignment, observed: ObservedDistances, inlier: np.ndarray, config: AlignmentConfig) -> str:

@@ -15,6 +15,7 @@ from densify.bending import BendingConfig
 from densify.contradiction import ContradictionConfig, uncontradicted, without
 from lightdepth.observations import observed_distances
 from lightdepth.prediction import DepthPrediction
+from lightdepth.robust import lmeds_scale
 from lightdepth.sparse_map import covisibility
 
 ALONE = AgreementConfig(overlap=0)
@@ -118,19 +119,31 @@ def test_what_floats_before_a_nearer_view_s_surface_is_contradicted_and_truth_is
         assert np.mean([k.sum() / p.valid.sum() for k, p in zip(kept, right, strict=True)]) > 0.9
 
 
-def test_depth_maps_that_err_each_in_its_own_way_are_not_flattened_so_that_they_agree():
-    """Flat maps agree best: with few points, overlap must help and not win."""
-    frames, submap, scale, shared = scene(0.3)
+def erring(points: int, spurious: float, size: float) -> tuple[list[View], list[DepthPrediction]]:
+    """Views with few points of depth maps that err smoothly, each in its own way."""
+    frames, submap, _, _ = scene(spurious)
     predictions, views = [], []
     for i, (keyframe, frame) in enumerate(zip(submap.keyframes, frames, strict=True)):
-        rng, right = np.random.default_rng(i), truth(frame)
-        bumps = rng.standard_normal((5, 6)).astype(np.float32)
+        right, bumps = truth(frame), np.random.default_rng(i).standard_normal((5, 6)).astype(np.float32)
         error = cv2.resize(bumps, right.distance.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        prediction = replace(right, distance=right.distance * np.exp(0.2 * error))
+        prediction = replace(right, distance=right.distance * np.exp(size * error))
         observed = observed_distances(keyframe, submap, prediction)
-        few = observed.subset(np.random.default_rng(i).permutation(len(observed)) < 30)
+        few = observed.subset(np.random.default_rng(i).permutation(len(observed)) < points)
+        views.append(View.of(keyframe, few, prediction, lmeds_scale(few.mapped, few.predicted).scale))
         predictions.append(prediction)
-        views.append(View.of(keyframe, few, prediction, scale))
-    alone, together = (agree(views, shared, c, BendingConfig()) for c in (ALONE, AgreementConfig()))
+    return views, predictions
+
+
+def test_depth_maps_that_err_each_in_its_own_way_are_not_flattened_so_that_they_agree():
+    """Flat maps agree best: with few points, overlap must help and not win."""
+    views, predictions = erring(30, 0.3, 0.2)
+    alone, together = (agree(views, scene(0.3)[3], c, BendingConfig()) for c in (ALONE, AgreementConfig()))
     assert min(bend.weights[1] for bend in together) > -0.5  # -1 is flat
     assert np.mean(errors(together, predictions, 0.3)) < 0.9 * np.mean(errors(alone, predictions, 0.3))
+
+
+@pytest.mark.parametrize(("points", "at_most"), [(40, 0.14), (400, 0.05)])
+def test_nearly_half_of_the_points_being_wrong_and_too_far_does_not_pull_the_scales(points, at_most):
+    views, predictions = erring(points, 0.45, 0.2)
+    bends = agree(views, scene(0.45)[3], AgreementConfig(), BendingConfig())
+    assert np.mean(errors(bends, predictions, 0.45)) < at_most

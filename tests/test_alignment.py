@@ -179,7 +179,7 @@ def test_a_threshold_that_is_none_is_refused():
         AlignmentConfig(t=0)
 
 
-def test_a_bend_is_judged_like_a_scale():
+def test_a_bend_that_deserves_no_trust_is_left_out_and_the_scale_stays():
     pairs = observed(wrong=0.3, noise=0.01)
     config = BendingConfig(grids=(2,))
     flat = Bend(config, 3.0, np.array([np.log(0.3), 0, 0, 0, 0, 0]), (100, 100))
@@ -188,7 +188,7 @@ def test_a_bend_is_judged_like_a_scale():
     assert same.ok and same.scale == pytest.approx(0.3) and same.bend is flat
     assert np.isin(same.outlier_ids, pairs.point_ids[280:]).mean() > 0.8
     tilted = replace(flat, weights=np.array([np.log(0.3), 1.5, 0, 0, 0, 0]))
-    assert not bent(before, tilted, pairs, AlignmentConfig()).ok
+    assert bent(before, tilted, pairs, AlignmentConfig()) is before
 
 
 def test_the_median_of_the_ratios_is_taken_as_it_is_and_wrong_points_pull_it():
