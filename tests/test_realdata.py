@@ -13,6 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from densify.agreement import AgreementConfig
 from densify.evaluation import evaluate_depth
@@ -42,11 +43,13 @@ def read_once(folder: Path, sparse_map: Path) -> FrameSequence:
     return FrameSequence(on_disk.names, load, on_disk.source)
 
 
-def dense_and_constant(realdata: Path) -> tuple[SubmapResult, SubmapResult]:
-    """The sinus map made dense by the closed form and by a constant distance."""
+def dense_and_constant(realdata: Path, every: int) -> tuple[SubmapResult, SubmapResult]:
+    """The sinus map's keyframes, so many of them, made dense by the closed form and by a constant distance."""
     map_folder = realdata / "sinus" / "derived_colmap" / "sparse_txt" / "0"
     frames = read_once(realdata / "sinus" / SINUS, map_folder)
-    fitted = fitted_to_frames(read_map(map_folder), *frames.image_size())
+    (submap,) = read_map(map_folder).submaps
+    chosen = SparseMap((replace(submap, keyframes=submap.keyframes[::every]),), "sinus")
+    fitted = fitted_to_frames(chosen, *frames.image_size())
     models = DeclineModel(details=False), ConstantModel()
     rigid = DensifyConfig(agreement=AgreementConfig(on=False))  # bent to the map, a constant would be the map's merit
     right, constant = (densify(frames, fitted, model, rigid)[0] for model in models)
@@ -57,10 +60,11 @@ def dense_and_constant(realdata: Path) -> tuple[SubmapResult, SubmapResult]:
     return right, constant
 
 
-def test_the_sinus_map_becomes_a_surface_better_than_a_constant_s(realdata):
-    """Seen: 35 of 35 keyframes, 87 % of the pixels, withheld points 5.8 % from the surface, a constant's 10.6 %."""
-    right, constant = dense_and_constant(realdata)
-    assert len(right.dense.alignments) == 35 and len(right.dense.aligned) >= 30
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_the_sinus_map_becomes_a_surface_better_than_a_constant_s(realdata, every):
+    """Seen of all: 35 of 35 keyframes, withheld points 6.0 % from the surface, a constant's 10.5 %."""
+    right, constant = dense_and_constant(realdata, every)
+    assert len(right.dense.alignments) == -(-35 // every) and len(right.dense.aligned) >= 30 / every
     assert right.seen_share >= 0.8
     assert right.withheld.median <= 0.7 * constant.withheld.median
 
