@@ -69,6 +69,7 @@ def test_the_sinus_map_becomes_a_surface_better_than_a_constant_s(realdata, ever
     assert right.withheld.median <= 0.7 * constant.withheld.median
 
 
+@pytest.mark.slow
 def test_two_submaps_of_the_sinus_stay_apart_and_fit_together_by_their_known_similarity(realdata, tmp_path):
     """Each has its own scale; nothing but the file says how they are related."""
     root = realdata / "sinus"
