@@ -50,7 +50,8 @@ def _torch_device() -> Finding:
     import torch
 
     if torch.cuda.is_available():
-        return Finding("device", True, f"cuda: {torch.cuda.get_device_name(0)}")
+        note = "" if native.has_warp() else "; synthetic colons are rendered on the CPU: pip install 'lightdepth[gpu]'"
+        return Finding("device", True, f"cuda: {torch.cuda.get_device_name(0)}{note}")
     return Finding(
         "device", True, f"cpu, {torch.get_num_threads()} threads (a GPU is used where there is one, never needed)"
     )

@@ -45,6 +45,7 @@ def synth(
     family: Literal["plain", "realistic"] = "plain",
     scene: TubeConfig = TubeConfig(),
     slam: SlamConfig = SlamConfig(),
+    device: Literal["auto", "cpu", "cuda"] = "auto",
     overwrite: bool = False,
 ) -> None:
     """A synthetic colon sequence with exact truth, and a multi-map SLAM export with known wrong points.
@@ -62,6 +63,7 @@ def synth(
         family: plain (the tube, its folds and its light) or realistic (with all that real images have)
         scene: ranges of shape, texture and sensor of plain colons
         slam: quality of the simulated SLAM
+        device: to render on: auto (the GPU where there is one and the extra gpu is installed), cpu or cuda
         overwrite: replace a folder made before
     """
     arguments = {k: v for k, v in locals().items() if k != "overwrite"}
@@ -78,7 +80,7 @@ def synth(
     chosen = read_light(light) if light is not None else None
     with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", frames) as bar:
         sequence = render_sequence(
-            seed, frames, tube_lens(lens, *size), travel_mm, scene, chosen, lambda *_: bar.advance()
+            seed, frames, tube_lens(lens, *size), travel_mm, scene, chosen, lambda *_: bar.advance(), device=device
         )
         made = sequence.frames
         if layout == "endomapper":  # which counts frames from 1

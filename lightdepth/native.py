@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
+from importlib.util import find_spec
 from types import ModuleType
 
 from lightdepth.errors import InputError
@@ -60,3 +61,23 @@ def pycolmap() -> ModuleType:
 
     pycolmap.logging.minloglevel = 2
     return pycolmap
+
+
+def has_warp() -> bool:
+    """Whether NVIDIA Warp is installed (extra [gpu])."""
+    return find_spec("warp") is not None
+
+
+@cache
+def warp() -> ModuleType:
+    """The warp module, quiet. Raises InputError where it is not installed."""
+    try:
+        import warp
+    except ImportError as error:
+        raise InputError(
+            f"NVIDIA Warp, which casts rays on a GPU, cannot be loaded ({error}). Install it: pip install "
+            "'lightdepth[gpu]'; or render on the CPU"
+        ) from error
+    warp.config.log_level = warp.LOG_ERROR  # or it greets, and warns where there is no GPU
+    warp.init()
+    return warp

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from colons import CAMERA, EXACT, SMALL, colon, slam
 
 from lightdepth.camera import KannalaBrandt, Pinhole, Scaramuzza
@@ -132,7 +133,8 @@ def lit_from_wall(reflectance: float) -> np.ndarray:
     config = replace(SMALL, sensor=replace(SMALL.sensor, reflectance=(reflectance, reflectance)))
     rng = np.random.default_rng(2)
     tube = Tube(config, rng)
-    return tube._indirect(camera_path(tube.shape, 1, 10.0, rng)[0])
+    pose = torch.from_numpy(camera_path(tube.shape, 1, 10.0, rng)).float()
+    return tube._indirect(pose[:, :3, :3].mT, pose[:, :3, 3:]).values.numpy()
 
 
 def test_a_wall_that_reflects_nothing_gives_no_indirect_light():

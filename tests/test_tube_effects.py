@@ -156,25 +156,24 @@ def test_the_head_of_a_stalked_polyp_overhangs():
 
 
 def test_motion_blur_is_as_long_as_asked_and_nothing_moves_where_nothing_is_known():
-    distance = view().true_distance
-    lengths = []
-    for seed in range(40):
-        flow = image_flow(distance, CAMERA, 0.05, np.random.default_rng(seed))
-        assert not flow[distance == 0].any()
-        lengths.append(np.median(np.linalg.norm(flow[distance > 0], axis=-1)))
-    assert np.median(lengths) == pytest.approx(0.05 * CAMERA.height, rel=0.35)
-    assert not image_flow(np.zeros_like(distance), CAMERA, 0.05, np.random.default_rng(0)).any()
+    distance, rngs = torch.from_numpy(view().true_distance), [np.random.default_rng(seed) for seed in range(40)]
+    flows = image_flow(distance.expand(40, -1, -1), CAMERA, 0.05, rngs)
+    assert not flows[:, distance == 0].any()
+    lengths = flows[:, distance > 0].norm(dim=-1).median(1).values
+    assert lengths.median() == pytest.approx(0.05 * CAMERA.height, rel=0.35)
+    assert not image_flow(torch.zeros_like(distance)[None], CAMERA, 0.05, rngs[:1]).any()
 
 
 def test_a_point_of_light_is_smeared_along_the_flow_and_only_there():
-    linear = np.zeros((40, 40, 3))
-    linear[20, 20] = 1.0
-    flow = np.zeros((40, 40, 2), np.float32)
+    linear = torch.zeros(1, 3, 40, 40)
+    linear[..., 20, 20] = 1.0
+    flow = torch.zeros(1, 40, 40, 2)
     flow[..., 0] = 9
     quiet = SensorConfig(noise=(0.0, 0.0), exposure=(0.0, 0.0), bright_share=(0.0, 0.0), shoulder=(1.0, 1.0))
     rng = np.random.default_rng
     sensor = draw_sensor(quiet, 1.0, rng(0), rng(0))
-    image = expose(linear, np.ones((40, 40), bool), np.ones((40, 40)), flow, sensor, rng(0), rng(0))
+    seen = torch.ones(1, 40, 40, dtype=torch.bool)
+    (image,) = expose(linear, seen, torch.ones(40, 40), flow, sensor, rng(0), [rng(0)])
     rows, columns, _ = image.nonzero()
     assert set(rows) == {20} and 7 <= np.ptp(columns) <= 11
 

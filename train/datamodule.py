@@ -44,6 +44,8 @@ class TubeData:
             scene of five is no colon but a hollow looked at from anywhere (lightdepth.tube.cavity), and every scene
             has a field of view of its own.
         scene: ranges of one's own instead of the family's; mu, gamma and reflectance above hold in any case.
+        device: to render on: auto (the GPU where there is one and the extra gpu is installed), cpu or cuda. The same
+            colons on any, up to rounding.
     """
 
     scenes: int = 0
@@ -56,6 +58,7 @@ class TubeData:
     reflectance: tuple[float, float] = (0.0, 0.7)
     family: Literal["plain", "realistic", "mixed"] = "plain"
     scene: TubeConfig | None = None
+    device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
 _NO_TUBE = TubeData()
@@ -319,7 +322,7 @@ def tube_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> 
 
     camera, config = lens(tube.lenses[index % len(tube.lenses)], *size), tube_config(tube, index)
     mask = any_field(camera, np.random.default_rng([seed, _FIELD])) if tube.family == "mixed" else None
-    frames = tube_frames(seed, tube.frames, camera, travel=tube.travel, config=config, mask=mask)
+    frames = tube_frames(seed, tube.frames, camera, tube.travel, config, mask=mask, device=tube.device)
     return [to_batch(frame, size) for frame in frames]
 
 

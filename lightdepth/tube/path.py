@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole
 from lightdepth.datasets.c3vd import C3VD
@@ -119,23 +122,29 @@ def camera_path(
     return poses
 
 
-def image_flow(distance: np.ndarray, camera: CameraModel, length: float, rng: np.random.Generator) -> np.ndarray:
-    """Flow (H, W, 2) [px] during an exposure, of median length `length` times the image height, for a random motion.
+def image_flow(distance: Tensor, camera: CameraModel, length: float, rngs: Sequence[np.random.Generator]) -> Tensor:
+    """Flow (B, H, W, 2) [px] during an exposure, of median length `length` times the image height, for random motions.
 
-    The endoscope shifts and turns at once; distance (H, W) in mm, 0 where unknown: there the flow is 0.
+    The endoscope shifts and turns at once, drawn from one generator a view; distance (B, H, W) in mm, 0 where unknown:
+    there the flow is 0.
     """
+    motions = [(rng.normal(0, (0.15, 0.15, 0.3)), rng.normal(0, 0.01, 3), rng.uniform(0, 2)) for rng in rngs]
+    shift, turn, reach = (
+        torch.as_tensor(np.array(column), dtype=distance.dtype, device=distance.device).reshape(len(rngs), 1, 1, -1)
+        for column in zip(*motions, strict=True)
+    )
     known = distance > 0
-    rays, flow = camera.rays()[0], np.zeros((*distance.shape, 2), np.float32)
-    if not known.any():
-        return flow
-    points = rays[known] * distance[known, None]
-    shift, turn = rng.normal(0, (0.15, 0.15, 0.3)), rng.normal(0, 0.01, 3)
-    ahead, ahead_valid = camera.project(points + shift + np.cross(turn, points))
-    here, here_valid = camera.project(points)
-    moved = np.where((ahead_valid & here_valid)[:, None], ahead - here, 0)
-    median = float(np.median(np.linalg.norm(moved, axis=-1)))
-    reach = rng.uniform(0, 2) * length * distance.shape[0]
-    moved *= reach / max(median, 1e-6)
-    longest = np.linalg.norm(moved, axis=-1, keepdims=True).clip(min=1e-6)
-    flow[known] = moved * np.minimum(1, 4 * reach / longest)
-    return flow
+    rays = torch.tensor(camera.rays()[0], dtype=distance.dtype, device=distance.device)
+    points = torch.where(known[..., None], rays * distance[..., None], rays)
+    ahead, ahead_valid = camera.project(points + shift + torch.linalg.cross(turn.expand_as(points), points))
+    rows, columns = (torch.arange(n, dtype=points.dtype, device=points.device) + 0.5 for n in distance.shape[1:])
+    here = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
+    moved = torch.where((known & ahead_valid)[..., None], ahead - here, 0)
+    size = torch.hypot(*moved.unbind(-1))
+    medians = [
+        one[inside].median() if inside.any() else one.new_ones(()) for one, inside in zip(size, known, strict=True)
+    ]
+    reach = reach * length * distance.shape[1]
+    scale = reach / torch.stack(medians).clamp(min=1e-6).reshape(-1, 1, 1, 1)
+    longest = 4 * reach / (size[..., None] * scale).clamp(min=1e-6)
+    return moved * scale * longest.clamp(max=1)

@@ -1,30 +1,38 @@
 """A synthetic colon that can be looked at: ray casting, and the light of lightdepth.photometry with what it leaves out.
+Many views at once, on the CPU or a GPU.
 
 A view has: direct light from a spot beside the camera, light from the wall to the wall (radiosity between patches of
 the whole tube with true occlusion: not the approximation that the losses use), highlights on wet and rough wall, and
-what lightdepth.tube.sensor makes of it. Lengths in millimetres; images (H, W, 3); patches are a coarse grid over
-(s, phi). Every effect beyond the first colons' draws from a generator of its own: on or off, the rest stays the same
-(but a wall of another circumference needs another sheet of paint).
+what lightdepth.tube.sensor makes of it. Lengths in millimetres; patches are a coarse grid over (s, phi). Every effect
+beyond the first colons' draws from a generator of its own: on or off, the rest stays the same (but a wall of another
+circumference needs another sheet of paint). All draws are NumPy's, so that a seed gives the same colon and the same
+noise on every device, up to rounding.
+
+Notation of tensors: B views, P pixels inside the mask, N patches; vectors (B, 3, P). A place (B, P, 2) on the wall is
+(phi, s), each from -1 to 1, which samples every map over (s, phi) whatever its size (lightdepth.tube.wall).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
-from lightdepth import native
 from lightdepth.camera import CameraModel
-from lightdepth.photometry import PhotometricCalibration, irradiance
+from lightdepth.photometry import LightTerms, PhotometricCalibration, irradiance
 from lightdepth.radiosity import form_factors
+from lightdepth.tube.casting import Caster, EmbreeCaster, make_caster
 from lightdepth.tube.film import FilmConfig, cover, fine_relief
 from lightdepth.tube.path import PathConfig, image_flow
 from lightdepth.tube.polyps import tinted
 from lightdepth.tube.sensor import SensorConfig, draw_sensor, expose
 from lightdepth.tube.shape import ShapeConfig, TubeShape, make_shape, smooth_noise
 from lightdepth.tube.texture import TextureConfig, make_texture
+from lightdepth.tube.wall import WallMap, place_of
 
 
 @dataclass(frozen=True)
@@ -124,10 +132,16 @@ class View:
 
 
 class Tube:
-    """One colon and one endoscope in it, drawn from `config` by `rng`."""
+    """One colon and one endoscope in it, drawn from `config` by `rng`; looked at on `device`."""
 
-    def __init__(self, config: TubeConfig, rng: np.random.Generator, light: PhotometricCalibration | None = None):
-        o3d = native.open3d()
+    def __init__(
+        self,
+        config: TubeConfig,
+        rng: np.random.Generator,
+        light: PhotometricCalibration | None = None,
+        device: torch.device | str = "cpu",
+    ):
+        self.device = torch.device(device)
         film_rng, surface_rng, sensor_rng, tint_rng = rng.spawn(4)
         self.shape: TubeShape = self._make_shape(config.shape, rng)
         rings, spokes = self.shape.vertices.shape[:2]
@@ -135,7 +149,7 @@ class Tube:
         albedo = self._make_texture(rings * self.shape.step, circumference, config.texture, rng)
         albedo = tinted(albedo, self.shape.polyps, self.shape.radius, spokes, self.shape.step, tint_rng)
         self.albedo, self.film = cover(albedo, config.texture.resolution, config.film, film_rng)
-        self._bumps = [smooth_noise((rings * 2, spokes * 2), (0.9, 0.9), rng).astype(np.float32) for _ in range(2)]
+        bumps = np.stack([smooth_noise((rings * 2, spokes * 2), (0.9, 0.9), rng) for _ in range(2)], -1)
         sensor = config.sensor
         self.light = _draw_light(sensor, rng)
         if light is not None:
@@ -145,13 +159,12 @@ class Tube:
         self.cosine_exponent = surface_rng.uniform(*sensor.cosine_exponent)
         self.gloss, self.roughness = surface_rng.uniform(*sensor.gloss), surface_rng.uniform(*sensor.roughness)
         self.sparkle = surface_rng.uniform(*sensor.sparkle)
-        self._relief = fine_relief(surface_rng) if self.sparkle > 0 else None
-        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self._tensor = lambda array: o3d.core.Tensor(np.ascontiguousarray(array, np.float32))
-        self._scene.add_triangles(
-            self._tensor(self.shape.vertices.reshape(-1, 3)), o3d.core.Tensor(self.shape.faces.astype(np.uint32))
-        )
+        self._relief = self._tensor(fine_relief(surface_rng).transpose(2, 0, 1)) if self.sparkle > 0 else None
+        self._caster: Caster = make_caster(self.shape.vertices.reshape(-1, 3), self.shape.faces, self.device)
         self._least_cosine, self._patch = config.least_cosine, config.patch
+        self._paint, self._bumps, self._normals = map(self._map, (self.albedo, bumps, self.shape.normals))
+        self._wet = None if self.film.wet is None else self._map(self.film.wet)
+        self._domes = None if self.film.slopes is None else self._map(self.film.slopes)
         self._patches = self._make_patches()
 
     _make_shape = staticmethod(make_shape)
@@ -160,175 +173,164 @@ class Tube:
 
     def view(self, world_from_cam: np.ndarray, camera: CameraModel, mask: np.ndarray, rng: np.random.Generator) -> View:
         """What the endoscope sees from a pose (4, 4) [mm]; pixels outside mask (H, W) are black."""
-        (own,) = rng.spawn(1)
-        rays, rays_valid = camera.rays()
+        return self.views(world_from_cam[None], camera, mask, rng)[0]
+
+    def views(
+        self, world_from_cam: np.ndarray, camera: CameraModel, mask: np.ndarray, rng: np.random.Generator
+    ) -> list[View]:
+        """What the endoscope sees from poses (B, 4, 4) [mm], as one batch: what `view` would give one by one."""
+        count = len(world_from_cam)
+        owns = rng.spawn(count)
+        every_ray, rays_valid = camera.rays()
         wanted = mask & rays_valid
-        directions = rays[wanted] @ world_from_cam[:3, :3].T
-        origin = np.broadcast_to(world_from_cam[:3, 3], directions.shape)
-        hit = self._scene.cast_rays(self._tensor(np.concatenate([origin, directions], -1)))
-        t = hit["t_hit"].numpy()
-        met = np.isfinite(t)
-        ring, spoke = self._grid_position(hit["primitive_ids"].numpy()[met], hit["primitive_uvs"].numpy()[met])
-        normals = _bilinear(self.shape.normals.astype(np.float32), ring, spoke)
-        normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-9) @ world_from_cam[:3, :3]
-        rows, columns = wanted.nonzero()
-        index = (rows[met], columns[met])
+        cam_from_world = self._tensor(world_from_cam[:, :3, :3].transpose(0, 2, 1))
+        origin = self._tensor(world_from_cam[:, :3, 3:])
+        directions = self._tensor(every_ray[wanted] @ world_from_cam[:, :3, :3].transpose(0, 2, 1))
+        rays = self._tensor(every_ray[wanted].T[None])
+        hit = self._caster.cast(origin.mT.expand_as(directions).reshape(-1, 3), directions.reshape(-1, 3))
+        t, face, uv = (part.reshape(count, -1, *part.shape[1:]).to(self.device) for part in hit)
+        met = t.isfinite()
+        t = torch.where(met, t, 1.0)
+        place = place_of(torch.where(met, face, 0), uv, self.shape.vertices.shape[:2])
+        normals = cam_from_world @ _unit(self._normals.at(place))
         if self._least_cosine > 0:
-            lacking = (self._least_cosine + (normals * rays[index]).sum(-1)).clip(min=0)
-            normals = normals - lacking[:, None] * rays[index]
-            normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        distance = np.zeros(mask.shape, np.float32)
-        distance[index] = t[met]
-        all_normals = np.zeros((*mask.shape, 3), np.float32)
-        all_normals[index] = normals
-        linear = np.zeros((*mask.shape, 3))
-        linear[index] = self._shade(t[met], normals, rays[index], ring, spoke, world_from_cam)
-        flow = image_flow(distance, camera, self.sensor.motion, own) if self.sensor.motion > 0 else None
-        image = self._expose(linear, distance > 0, rays[..., 2], flow, self.sensor, rng, own)
-        return View(image, distance, all_normals)
+            lacking = (self._least_cosine + (normals * rays).sum(1, keepdim=True)).clamp(min=0)
+            normals = _unit(normals - lacking * rays)
+        linear = self._shade(t, normals, rays, place, cam_from_world, origin)
+
+        def image(values: Tensor) -> Tensor:
+            """(B, C, P) -> (B, C, H, W), 0 where no wall was met."""
+            whole = values.new_zeros((*values.shape[:2], mask.size))
+            return whole.index_copy_(2, inside, values * met[:, None]).unflatten(-1, mask.shape)
+
+        inside = torch.as_tensor(np.flatnonzero(wanted), device=self.device)
+        distance = image(t[:, None])[:, 0]
+        flow = image_flow(distance, camera, self.sensor.motion, owns) if self.sensor.motion > 0 else None
+        ray_z = self._tensor(every_ray[..., 2])
+        images = self._expose(image(linear), distance > 0, ray_z, flow, self.sensor, rng, owns)
+        parts = (images, distance.cpu().numpy(), image(normals).permute(0, 2, 3, 1).cpu().numpy())
+        return [View(*(np.ascontiguousarray(part[i]) for part in parts)) for i in range(count)]
 
     def distance_to_wall(self, points: np.ndarray) -> np.ndarray:
         """Exact distance (n,) [mm] from points (n, 3) to the mesh."""
-        return self._scene.compute_distance(self._tensor(points)).numpy()
+        return self._on_cpu.distance(points)
 
-    def _grid_position(self, faces: np.ndarray, uvs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Continuous (ring, spoke) of hits; the spoke may reach the number of spokes, which is spoke 0 again."""
-        spokes = self.shape.vertices.shape[1]
-        cell, second = faces // 2, faces % 2 == 1
-        i, j = (cell // spokes).astype(np.float32), (cell % spokes).astype(np.float32)
-        w1, w2 = uvs[:, 0], uvs[:, 1]
-        # Triangles (a, b, c) and (b, d, c) of a cell with a (0, 0), b (0, 1), c (1, 0), d (1, 1) as (ring, spoke).
-        ring = i + np.where(second, w1 + w2, w2)
-        spoke = j + np.where(second, 1 - w2, w1)
-        return ring, spoke
+    @cached_property
+    def _on_cpu(self) -> EmbreeCaster:
+        if isinstance(self._caster, EmbreeCaster):
+            return self._caster
+        return EmbreeCaster(self.shape.vertices.reshape(-1, 3), self.shape.faces)
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(self.device)
+
+    def _map(self, array: np.ndarray) -> WallMap:
+        return WallMap.of(self._tensor(array.reshape(*array.shape[:2], -1))[None])
 
     def _shade(
-        self,
-        t: np.ndarray,
-        normals: np.ndarray,
-        rays: np.ndarray,
-        ring: np.ndarray,
-        spoke: np.ndarray,
-        world_from_cam: np.ndarray,
-    ) -> np.ndarray:
-        """Linear RGB (n, 3) with gain 1."""
-        albedo = _bilinear(self.albedo, *self._to_map(ring, spoke, self.albedo))
-        direct = self._direct(t, normals, rays)
-        indirect = _bilinear(self._indirect(world_from_cam), *self._to_map(ring, spoke, self._patches.grid))
-        linear = albedo * (direct[:, None] + indirect)
+        self, t: Tensor, normals: Tensor, rays: Tensor, place: Tensor, cam_from_world: Tensor, origin: Tensor
+    ) -> Tensor:
+        """Linear RGB (B, 3, P) with gain 1, at distances t (B, P) along rays (1, 3, P), seen from origin (B, 3, 1) with
+        rotation cam_from_world (B, 3, 3)."""
+        direct = self._direct(t, normals, rays)[:, None]
+        linear = self._paint.at(place) * (direct + self._indirect(cam_from_world, origin).at(place))
         if self.specular > 0:
-            linear = linear + self._highlights(t, normals, rays, ring, spoke, world_from_cam)[:, None]
+            linear = linear + self._highlights(t, normals, rays, place, cam_from_world)[:, None]
         return linear
 
-    def _highlights(
-        self,
-        t: np.ndarray,
-        normals: np.ndarray,
-        rays: np.ndarray,
-        ring: np.ndarray,
-        spoke: np.ndarray,
-        world_from_cam: np.ndarray,
-    ) -> np.ndarray:
-        """White light (n,) that the wet surface mirrors back."""
-        slopes = [_bilinear(b[..., None], *self._to_map(ring, spoke, b))[:, 0] for b in self._bumps]
+    def _highlights(self, t: Tensor, normals: Tensor, rays: Tensor, place: Tensor, cam_from_world: Tensor) -> Tensor:
+        """White light (B, P) that the wet surface mirrors back."""
+        rings, spokes = self.shape.vertices.shape[:2]
+        ring, spoke = (place[..., 1] + 1) / 2 * (rings - 1), (place[..., 0] + 1) / 2 * spokes
+        row = (ring + 1e-3).long().clamp(0, rings - 1)
         # Towards the closed end the grid's cells shrink to a point: keep the bumps from becoming spokes there.
-        row = np.clip(ring.astype(int), 0, len(self.shape.radius) - 1)
-        flat = np.clip(self.shape.radius[row] / self.shape.radius.mean() - 0.3, 0, 0.7) / 0.7
-        gloss: np.ndarray | float = self.gloss
-        strength: np.ndarray | float = self.specular
-        rough: np.ndarray | float = self.roughness
-        film = self.film
-        if film.wet is not None:  # mucus is smoother and shines more than the wall
-            wet = _bilinear(film.wet[..., None], *self._to_map(ring, spoke, film.wet))[:, 0]
+        mean = float(self.shape.radius.mean())
+        flat = (self._tensor(self.shape.radius)[row] / mean - 0.3).clamp(0, 0.7) / 0.7
+        gloss: Tensor | float = self.gloss
+        strength: Tensor | float = self.specular
+        rough: Tensor | float = self.roughness
+        if self._wet is not None:  # mucus is smoother and shines more than the wall
+            wet = self._wet.at(place)[:, 0]
             gloss, strength, rough = gloss * (1 + wet), strength * (0.7 + wet), rough * (1 - 0.4 * wet)
-        slopes = [slope * flat for slope in slopes]
-        tilted = normals + (rough * np.stack([slopes[0], slopes[1], np.zeros_like(slopes[0])], 0)).T
-        if self._relief is not None or film.slopes is not None:
-            fine = np.zeros((len(t), 2), np.float32)
+        slopes = (rough * flat)[:, None] * self._bumps.at(place)
+        tilted = torch.cat([normals[:, :2] + slopes, normals[:, 2:]], 1)
+        if self._relief is not None or self._domes is not None:
+            fine = torch.zeros_like(slopes)
             if self._relief is not None:
-                texels, spokes = 0.15, self.shape.vertices.shape[1]
-                place = np.stack([ring * self.shape.step, spoke * 2 * np.pi * self.shape.radius.mean() / spokes], -1)
-                u, v = np.round(place / texels).astype(int).T % len(self._relief)
+                texel, size = 0.15, self._relief.shape[1]
+                u = (ring * (self.shape.step / texel)).round().long() % size
+                v = (spoke * (2 * np.pi * mean / spokes / texel)).round().long() % size
                 # Relief smaller than a pixel is averaged away.
-                unresolved = 0.02 * t / texels
-                fine += (self.sparkle * flat / np.sqrt(1 + unresolved**2))[:, None] * self._relief[u, v]
-            if film.slopes is not None:
-                fine += _bilinear(film.slopes, *self._to_map(ring, spoke, film.slopes))
-            along_s = self.shape.frames[row, 0] @ world_from_cam[:3, :3]
-            along_phi = np.cross(along_s, normals)
+                unresolved = 0.02 * t / texel
+                depth = self.sparkle * flat / (1 + unresolved**2).sqrt()
+                fine = depth[:, None] * self._relief[:, u, v].transpose(0, 1)
+            if self._domes is not None:
+                fine = fine + self._domes.at(place)
+            along_s = cam_from_world @ self._tensor(self.shape.frames[:, 0].T)[:, row].transpose(0, 1)
+            along_phi = torch.linalg.cross(along_s, normals, dim=1)
             tilted = tilted + fine[:, :1] * along_s + fine[:, 1:] * along_phi
-        tilted /= np.linalg.norm(tilted, axis=-1, keepdims=True)
-        lobe = np.clip((-rays * tilted).sum(-1), 0, 1) ** gloss
+        lobe = (-rays * _unit(tilted)).sum(1).clamp(0, 1) ** gloss
         return strength * lobe * self._direct(t, -rays, rays) * 4
 
-    def _direct(self, t: np.ndarray, normals: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        def image(array: np.ndarray) -> torch.Tensor:
-            return torch.from_numpy(np.ascontiguousarray(array.reshape(len(t), -1).T))[None, :, None, :].double()
-
-        light = self.light.terms(torch.float64)
-        return irradiance(image(t), image(normals), image(rays), light, self.cosine_exponent).numpy().ravel()
-
-    def _to_map(self, ring: np.ndarray, spoke: np.ndarray, array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mesh grid position -> position on another map over (s, phi)."""
-        rings, spokes = self.shape.vertices.shape[:2]
-        return ring * (array.shape[0] - 1) / (rings - 1), spoke * array.shape[1] / spokes
+    def _direct(self, t: Tensor, normals: Tensor, rays: Tensor) -> Tensor:
+        """(B, P) of t (B, P), normals and rays (B or 1, 3, P)."""
+        light = LightTerms(*(term.to(self.device) for term in self.light.terms()))
+        parts = t[:, None, None], normals[:, :, None], rays[:, :, None]
+        return irradiance(*parts, light, self.cosine_exponent)[:, 0, 0]
 
     def _make_patches(self) -> _Patches:
-        rings, spokes = self.shape.vertices.shape[:2]
-        n_s, n_phi = max(8, round(rings * self.shape.step / self._patch)), 22
-        r = np.linspace(0, rings - 1, n_s)
-        p = np.arange(n_phi) * spokes / n_phi
-        ring, spoke = (a.ravel() for a in np.meshgrid(r, p, indexing="ij"))
-        points = _bilinear(self.shape.vertices.astype(np.float32), ring, spoke)
-        normals = _bilinear(self.shape.normals.astype(np.float32), ring, spoke)
-        normals /= np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-9)
+        n_s, n_phi = max(8, round(len(self.shape.vertices) * self.shape.step / self._patch)), 22
+        # Each (s, phi) of the coarse grid once: the column at the seam is the first again.
+        phi, s = np.meshgrid(np.arange(n_phi) * 2 / n_phi - 1, np.linspace(-1, 1, n_s))
+        place = self._tensor(np.stack([phi, s], -1).reshape(1, -1, 2))
+        points = self._map(self.shape.vertices).at(place)[0].T
+        normals = _unit(self._normals.at(place))[0].T
         grid = points.reshape(n_s, n_phi, 3)
-        along_s = np.gradient(grid, axis=0)
-        wrapped = np.concatenate([grid[:, -1:], grid, grid[:, :1]], 1)
-        areas = np.linalg.norm(np.cross(along_s, (wrapped[:, 2:] - wrapped[:, :-2]) / 2), axis=-1).ravel()
-        kernel = form_factors(
-            *(torch.from_numpy(np.ascontiguousarray(a))[None].float() for a in (points, normals, areas))
-        )
-        factors = kernel[0].double().numpy()  # double, so that no bounce has to convert it
+        along_s = torch.gradient(grid, dim=0)[0]
+        wrapped = torch.cat([grid[:, -1:], grid, grid[:, :1]], 1)
+        areas = torch.linalg.cross(along_s, (wrapped[:, 2:] - wrapped[:, :-2]) / 2).norm(dim=-1).flatten()
+        factors = form_factors(points[None], normals[None], areas[None])[0]
         # A patch cannot light what it does not see.
-        i, j = np.nonzero(np.triu(factors + factors.T) > 1e-6)
+        i, j = torch.nonzero((factors + factors.T).triu() > 1e-6).unbind(-1)
         lifted = points + 0.4 * normals
-        blocked = self._blocked(lifted[i], lifted[j])
+        blocked = self._caster.blocked(lifted[i], lifted[j]).to(self.device)
         factors[i[blocked], j[blocked]] = factors[j[blocked], i[blocked]] = 0
         mean_albedo = cv2.resize(self.albedo, (n_phi, n_s), interpolation=cv2.INTER_AREA).reshape(-1, 3)
-        return _Patches(np.zeros((n_s, n_phi)), points, normals, lifted, factors, mean_albedo)
+        return _Patches((n_s, n_phi), points, normals, lifted, factors, self._tensor(mean_albedo))
 
-    def _blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        rays = np.concatenate([start, end - start], -1)
-        return self._scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0).numpy()
-
-    def _indirect(self, world_from_cam: np.ndarray) -> np.ndarray:
-        """Light from the wall on every patch (n_s, n_phi, 3) float32: rho K E summed over the bounces, per colour."""
-        patches = self._patches
-        rotation, origin = world_from_cam[:3, :3], world_from_cam[:3, 3]
-        in_cam = (patches.points - origin) @ rotation
-        t = np.linalg.norm(in_cam, axis=-1).clip(min=1e-6)
-        source = origin + rotation @ np.asarray(self.light.position_mm)
-        lit = ~self._blocked(np.broadcast_to(source, patches.lifted.shape), patches.lifted)
-        direct = self._direct(t, patches.normals @ rotation, in_cam / t[:, None]) * lit
+    def _indirect(self, cam_from_world: Tensor, origin: Tensor) -> WallMap:
+        """Light from the wall on every patch: rho K E summed over the bounces, per view and colour."""
+        patches, count = self._patches, len(origin)
         if self.light.reflectance == 0:
-            return np.zeros((*patches.grid.shape, 3), np.float32)
+            return WallMap.of(torch.zeros((count, *patches.grid, 3), device=self.device))
+        in_cam = cam_from_world @ (patches.points.T - origin)
+        t = in_cam.norm(dim=1).clamp(min=1e-6)
+        lamp = origin + cam_from_world.mT @ self._tensor(np.asarray(self.light.position_mm))[:, None]
+        ends = patches.lifted.expand(count, -1, -1)
+        dark = self._caster.blocked(lamp.mT.expand_as(ends).reshape(-1, 3), ends.reshape(-1, 3)).to(self.device)
+        direct = self._direct(t, cam_from_world @ patches.normals.T, in_cam / t[:, None])
+        source = (direct * ~dark.reshape(count, -1))[..., None]
         tint = self.light.reflectance * patches.albedo
-        total = direct[:, None] * np.ones(3)
+        total = source
         for _ in range(6):
             bounced = patches.factors @ (tint * total)
-            total = direct[:, None] + bounced
-        return bounced.reshape(*patches.grid.shape, 3).astype(np.float32)
+            total = source + bounced
+        return WallMap.of(bounced.reshape(count, *patches.grid, 3))
 
 
 @dataclass(frozen=True)
 class _Patches:
-    grid: np.ndarray  # (n_s, n_phi), only its shape matters
-    points: np.ndarray
-    normals: np.ndarray
-    lifted: np.ndarray
-    factors: np.ndarray
-    albedo: np.ndarray
+    grid: tuple[int, int]  # (n_s, n_phi)
+    points: Tensor
+    normals: Tensor
+    lifted: Tensor
+    factors: Tensor
+    albedo: Tensor
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    """Of vectors (B, 3, P); 0 stays 0."""
+    return vectors / vectors.square().sum(1, keepdim=True).sqrt().clamp(min=1e-9)
 
 
 def _draw_light(sensor: SensorConfig, rng: np.random.Generator) -> PhotometricCalibration:
@@ -342,18 +344,3 @@ def _draw_light(sensor: SensorConfig, rng: np.random.Generator) -> PhotometricCa
         reflectance=rng.uniform(*sensor.reflectance),
         source="published",
     )
-
-
-def _bilinear(array: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Samples (n, C) of a map (R, C', C) at continuous rows and columns; columns wrap."""
-    rows, columns = array.shape[:2]
-    r0 = np.clip(np.floor(row).astype(int), 0, rows - 2)
-    fr = np.clip(row - r0, 0, 1)[:, None].astype(np.float32)
-    c0 = np.floor(column).astype(int)
-    fc = (column - c0)[:, None].astype(np.float32)
-    c0, c1 = c0 % columns, (c0 + 1) % columns
-    flat = array.reshape(rows * columns, -1)
-    first, second = r0 * columns + c0, r0 * columns + c1
-    upper = flat.take(first, 0) * (1 - fc) + flat.take(second, 0) * fc
-    lower = flat.take(first + columns, 0) * (1 - fc) + flat.take(second + columns, 0) * fc
-    return upper * (1 - fr) + lower * fr

@@ -1,17 +1,21 @@
 """What an endoscope does to the light that it receives: lens, exposure, response, processor.
 
-Notation: linear images (H, W, 3), L the radiance with gain 1; codes in [0, 1]. In order: motion and focus blur,
+Notation: linear images (B, 3, H, W), L the radiance with gain 1; codes in [0, 1]. In order: motion and focus blur,
 vignetting cos^k psi, veiling glare L + g (mean - L), exposure, blooming of what is above white, colour cast, response
 v^(1/gamma), contrast, shoulder, noise, sharpening, rounding to 8 bits, JPEG.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
+from kornia.filters import gaussian_blur2d
+from torch import Tensor
 
 from lightdepth.photometry import encode
 
@@ -97,98 +101,130 @@ def draw_sensor(config: SensorConfig, gamma: float, rng: np.random.Generator, ow
 
 
 def expose(
-    linear: np.ndarray,
-    seen: np.ndarray,
-    ray_z: np.ndarray,
-    flow: np.ndarray | None,
+    linear: Tensor,
+    seen: Tensor,
+    ray_z: Tensor,
+    flow: Tensor | None,
     sensor: Sensor,
     rng: np.random.Generator,
-    own: np.random.Generator,
+    owns: Sequence[np.random.Generator],
 ) -> np.ndarray:
-    """Linear radiance (H, W, 3) to the image (H, W, 3) float32; pixels outside seen (H, W) are black.
+    """Linear radiance (B, 3, H, W) to images (B, H, W, 3) float32; pixels outside seen (B, H, W) are black.
 
-    ray_z (H, W) is cos psi; flow (H, W, 2) in pixels during the exposure, or None. `rng` draws exposure and read
-    noise, `own` what came later.
+    ray_z (H, W) is cos psi; flow (B, H, W, 2) in pixels during the exposure, or None. `rng` draws exposure and read
+    noise, one of `owns` for each view what came later.
     """
-    if not seen.any():
-        return np.zeros((*seen.shape, 3), np.float32)
-    height = seen.shape[0]
+    height, inside = seen.shape[1], seen[:, None]
     if flow is not None:
         linear = _moved(linear, flow)
     if sensor.defocus > 0:
-        linear = _blurred(linear, seen, sensor.defocus * height)
+        linear = _blurred(linear, inside, sensor.defocus * height)
     if sensor.vignetting > 0:
-        linear = linear * (ray_z.clip(min=0) ** sensor.vignetting)[..., None]
+        linear = linear * ray_z.clamp(min=0) ** sensor.vignetting
     if sensor.glare > 0:
-        veil = 0.5 * _blurred(linear, seen, 0.15 * height) + 0.5 * linear[seen].mean(0)
+        mean = (linear * inside).sum((2, 3), keepdim=True) / inside.sum((2, 3), keepdim=True).clamp(min=1)
+        veil = 0.5 * _blurred(linear, inside, 0.15 * height) + 0.5 * mean
         linear = linear + sensor.glare * (veil - linear)
 
     # Auto exposure on the brightest channel.
-    pixels = linear[seen]
-    target = np.quantile(pixels.max(-1), 1 - sensor.bright_share)
-    gain = float(np.exp(rng.normal(0, sensor.exposure))) / max(target, 1e-12)
-    pixels = gain * pixels
+    target = quantiles(linear.amax(1), seen, 1 - sensor.bright_share)
+    exposure, noise = _draws(seen, sensor, rng)
+    pixels = linear * (exposure / target.clamp(min=1e-12))
     if sensor.bloom > 0:
-        over = np.zeros_like(linear)
-        over[seen] = np.clip(pixels - 1, 0, 20)
+        over = (pixels - 1).clamp(0, 20) * inside
         spill = _blurred(over, None, 0.006 * height) + _blurred(over, None, 0.02 * height)
-        pixels = pixels + sensor.bloom / 2 * spill[seen]
+        pixels = pixels + sensor.bloom / 2 * spill
     if sensor.shot_noise > 0:
-        pixels = pixels + sensor.shot_noise * np.sqrt(pixels) * own.standard_normal(pixels.shape)
+        pixels = pixels + sensor.shot_noise * pixels.clamp(min=0).sqrt() * on_pixels(
+            seen, lambda view, count: owns[view].standard_normal((count, 3))
+        )
     if min(sensor.cast) < 1:
-        pixels = pixels * sensor.cast
-    code = encode(torch.from_numpy(pixels), sensor.gamma).numpy()
+        pixels = pixels * torch.tensor(sensor.cast, device=pixels.device, dtype=pixels.dtype).reshape(1, 3, 1, 1)
+    code = encode(pixels, sensor.gamma)
     if sensor.contrast != 0:
-        inside = code.clip(0, 1)
-        code = code + sensor.contrast * inside * (1 - inside) * (2 * inside - 1)
+        mid = code.clamp(0, 1)
+        code = code + sensor.contrast * mid * (1 - mid) * (2 * mid - 1)
     bend = max(1 - sensor.shoulder, 1e-3)
-    excess = np.clip(code - sensor.shoulder, 0, None)
-    code = np.where(excess > 0, sensor.shoulder + bend * (1.15 - 1.15 * np.exp(-excess / bend)), code)
-    code = code + rng.normal(0, sensor.noise, code.shape)
-
-    image = np.zeros((*seen.shape, 3))
-    image[seen] = code
+    excess = (code - sensor.shoulder).clamp(min=0)
+    code = torch.where(excess > 0, sensor.shoulder + bend * (1.15 - 1.15 * (-excess / bend).exp()), code)
+    image = (code + noise) * inside
     if sensor.sharpen > 0:
-        image += sensor.sharpen * (image - _blurred(image, seen, 0.006 * height))
-    image = np.round(np.clip(image, 0, 1) * 255) / 255
+        image = image + sensor.sharpen * (image - _blurred(image, inside, 0.006 * height))
+    image = (image.clamp(0, 1) * 255).round() / 255 * inside
+    images = image.permute(0, 2, 3, 1).cpu().numpy()
     if sensor.jpeg < 100:
-        image = _compressed(image, sensor.jpeg)
-    image[~seen] = 0
-    return image.astype(np.float32)
+        images = np.stack([_compressed(one, sensor.jpeg) for one in images]) * seen.cpu().numpy()[..., None]
+    return images
 
 
-def _blurred(image: np.ndarray, seen: np.ndarray | None, sigma: float) -> np.ndarray:
-    """Gaussian blur, normalised inside `seen`; wide ones at a reduced size."""
+def quantiles(values: Tensor, seen: Tensor, share: float) -> Tensor:
+    """The quantile (B, 1, 1, 1) of each of values (B, H, W) inside seen, 0 where nothing is."""
+    found = values.new_zeros(len(values), 1, 1, 1)
+    for view, (one, inside) in enumerate(zip(values, seen, strict=True)):
+        chosen = one[inside]
+        if len(chosen):
+            at = share * (len(chosen) - 1)
+            low = int(at)
+            below, above = (chosen.kthvalue(min(k, len(chosen) - 1) + 1).values for k in (low, low + 1))
+            found[view] = torch.lerp(below, above, at - low)
+    return found
+
+
+def on_pixels(seen: Tensor, draw: Callable[[int, int], np.ndarray]) -> Tensor:
+    """What draw(view, count) gives, (count, 3), for the pixels of each view inside seen: (B, 3, H, W)."""
+    drawn = np.zeros((*seen.shape, 3), np.float32)
+    for view, inside in enumerate(seen.cpu().numpy()):
+        if inside.any():
+            drawn[view, inside] = draw(view, int(inside.sum()))
+    return torch.from_numpy(drawn).to(seen.device).permute(0, 3, 1, 2)
+
+
+def _draws(seen: Tensor, sensor: Sensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Exposure (B, 1, 1, 1) and read noise (B, 3, H, W): one view's after the other's, whatever the batch."""
+    exposure = torch.ones(len(seen), 1, 1, 1)
+
+    def draw(view: int, count: int) -> np.ndarray:
+        exposure[view] = float(np.exp(rng.normal(0, sensor.exposure)))
+        return rng.normal(0, sensor.noise, (count, 3))
+
+    noise = on_pixels(seen, draw)
+    return exposure.to(seen.device), noise
+
+
+def _blurred(image: Tensor, seen: Tensor | None, sigma: float) -> Tensor:
+    """Gaussian blur of (B, C, H, W), normalised inside `seen` (B, 1, H, W); wide ones at a reduced size."""
+    whole = image.shape[-2:]
     small = max(1, int(sigma / 3))
-    size = (-(-image.shape[1] // small), -(-image.shape[0] // small))
-    whole = image.shape[1::-1]
+    size = 2 * round(4 * sigma / small) + 1
 
-    def smooth(array: np.ndarray) -> np.ndarray:
+    def smooth(values: Tensor) -> Tensor:
         if small > 1:
-            array = cv2.resize(array, size, interpolation=cv2.INTER_AREA)
-        array = cv2.GaussianBlur(array, (0, 0), sigma / small, borderType=cv2.BORDER_REPLICATE)
-        return cv2.resize(array, whole, interpolation=cv2.INTER_LINEAR) if small > 1 else array
+            values = F.interpolate(values, [-(-n // small) for n in whole], mode="area")
+        values = gaussian_blur2d(values, size, (sigma / small, sigma / small), "replicate")
+        return F.interpolate(values, whole, mode="bilinear", align_corners=False) if small > 1 else values
 
-    image = image.astype(np.float32)
     if seen is None:
         return smooth(image)
-    weight = seen.astype(np.float32)
-    return smooth(image * weight[..., None]) / smooth(weight).clip(min=1e-3)[..., None]
+    weighted = smooth(torch.cat([image * seen, seen.to(image.dtype)], 1))
+    return weighted[:, :-1] / weighted[:, -1:].clamp(min=1e-3)
 
 
-def _moved(linear: np.ndarray, flow: np.ndarray, poses: int = 7) -> np.ndarray:
-    """The mean over the exposure, from the middle frame's flow (H, W, 2)."""
-    grid = np.stack(np.meshgrid(np.arange(linear.shape[1]), np.arange(linear.shape[0])), -1).astype(np.float32)
-    image, total = linear.astype(np.float32), np.zeros(linear.shape, np.float32)
-    for part in np.linspace(-0.5, 0.5, poses):
-        at = grid + np.float32(part) * flow
-        total += cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+def _moved(linear: Tensor, flow: Tensor, poses: int = 7) -> Tensor:
+    """The mean over the exposure, from the middle frame's flow (B, H, W, 2)."""
+    height, width = linear.shape[-2:]
+    per_pixel = torch.tensor([2 / width, 2 / height], device=linear.device)
+    rows, columns = (torch.arange(n, device=linear.device) + 0.5 for n in (height, width))
+    grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1) * per_pixel - 1
+    total = torch.zeros_like(linear)
+    for part in torch.linspace(-0.5, 0.5, poses).tolist():
+        at = grid + part * flow * per_pixel
+        total += F.grid_sample(linear, at, mode="bilinear", padding_mode="border", align_corners=False)
     return total / poses
 
 
 def _compressed(image: np.ndarray, quality: int) -> np.ndarray:
     options = [cv2.IMWRITE_JPEG_QUALITY, quality]  # OpenCV halves the chroma of colour images
-    packed = cv2.imencode(".jpg", (image[..., ::-1] * 255).astype(np.uint8), options)[1]
+    packed = cv2.imencode(".jpg", np.round(image[..., ::-1] * 255).astype(np.uint8), options)[1]
     unpacked = cv2.imdecode(packed, cv2.IMREAD_COLOR)
     assert unpacked is not None
     return unpacked[..., ::-1].astype(np.float32) / 255

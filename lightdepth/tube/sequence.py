@@ -10,8 +10,11 @@ import numpy as np
 from lightdepth.camera import CameraModel
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.tube.casting import rendering_device
 from lightdepth.tube.path import camera_path, lens, octagon
 from lightdepth.tube.scene import Tube, TubeConfig
+
+_PIXELS_AT_ONCE = {"cpu": 100_000, "cuda": 4_000_000}  # beyond, a CPU's caches overflow, and a small GPU's memory
 
 
 @dataclass(frozen=True)
@@ -32,31 +35,36 @@ def render_sequence(
     progress: Callable[[int, int], None] | None = None,
     kind: type[Tube] = Tube,
     mask: np.ndarray | None = None,
+    device: str = "auto",
 ) -> TubeSequence:
     """A colon drawn from `seed`, seen in `count` frames along `travel` mm. Frames carry the light's true calibration
     with gain 1 (exposure is automatic, so the true gain differs per frame), distance and pose in mm. `mask` (H, W) is
-    the field of view, an octagon if left out."""
+    the field of view, an octagon if left out. Rendered on `device` (auto: the GPU where there is one) in batches: a
+    seed gives the same frames everywhere, up to rounding. Raises InputError for a device that is not there."""
     rng = np.random.default_rng(seed)
     config = config or TubeConfig()
-    tube = kind(config, rng, light)
+    tube = kind(config, rng, light, rendering_device(device))
     mask = octagon(camera) if mask is None else mask
-    frames = []
-    for i, pose in enumerate(camera_path(tube.shape, count, travel, rng, config=config.path)):
-        view = tube.view(pose, camera, mask, rng)
-        frames.append(
-            Frame(
-                f"{i:06d}",
-                view.image,
-                camera,
-                replace(tube.light, gain=1.0),
-                mask,
-                time=i / 30.0,
-                true_distance=view.distance,
-                true_world_from_cam=pose,
+    poses = camera_path(tube.shape, count, travel, rng, config=config.path)
+    at_once = max(1, _PIXELS_AT_ONCE[tube.device.type] // mask.size)
+    frames: list[Frame] = []
+    for first in range(0, count, at_once):
+        batch = poses[first : first + at_once]
+        for pose, view in zip(batch, tube.views(batch, camera, mask, rng), strict=True):
+            frames.append(
+                Frame(
+                    f"{len(frames):06d}",
+                    view.image,
+                    camera,
+                    replace(tube.light, gain=1.0),
+                    mask,
+                    time=len(frames) / 30.0,
+                    true_distance=view.distance,
+                    true_world_from_cam=pose,
+                )
             )
-        )
-        if progress is not None:
-            progress(i + 1, count)
+            if progress is not None:
+                progress(len(frames), count)
     return TubeSequence(frames, tube)
 
 
@@ -68,8 +76,9 @@ def tube_frames(
     config: TubeConfig | None = None,
     light: PhotometricCalibration | None = None,
     mask: np.ndarray | None = None,
+    device: str = "auto",
 ) -> list[Frame]:
     """Frames for training: `count` views spread over `travel` mm of one colon (C3VD's lens at 160x128 by default)."""
     camera = camera or lens("c3vd", 160, 128)
-    frames = render_sequence(seed, count, camera, travel, config, light, mask=mask).frames
+    frames = render_sequence(seed, count, camera, travel, config, light, mask=mask, device=device).frames
     return [replace(frame, name=f"tube{seed}_{frame.name}") for frame in frames]

@@ -8,6 +8,7 @@ are those of lightdepth.tube.scene. Lengths in mm.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -16,13 +17,14 @@ import torch
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
-from lightdepth.photometry import PhotometricCalibration, light_distance
+from lightdepth.photometry import LightTerms, PhotometricCalibration, light_distance
 from lightdepth.tube.scene import Tube, TubeConfig
-from lightdepth.tube.sensor import Sensor, SensorConfig
+from lightdepth.tube.sensor import Sensor, SensorConfig, on_pixels, quantiles
 from lightdepth.tube.sequence import render_sequence
 from lightdepth.tube.shape import ShapeConfig, TubeShape, centreline, closed, swept
 from lightdepth.tube.texture import TextureConfig
@@ -50,7 +52,13 @@ def variant_frames(
 class VariantTube(Tube):
     """A colon of the other make. `lamp_power` is k of cos^k."""
 
-    def __init__(self, config: TubeConfig, rng: np.random.Generator, light: PhotometricCalibration | None = None):
+    def __init__(
+        self,
+        config: TubeConfig,
+        rng: np.random.Generator,
+        light: PhotometricCalibration | None = None,
+        device: torch.device | str = "cpu",
+    ):
         (own,) = rng.spawn(1)
         self.lamp_power = float(own.uniform(0.5, 3.0))
         known = PhotometricCalibration(
@@ -60,21 +68,17 @@ class VariantTube(Tube):
             reflectance=float(own.uniform(*config.sensor.reflectance)),
             source="published",
         )
-        super().__init__(config, rng, light or known)
+        super().__init__(config, rng, light or known, device)
 
-    def _direct(self, t: np.ndarray, normals: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    def _direct(self, t: Tensor, normals: Tensor, rays: Tensor) -> Tensor:
         """The mean over the lamps of cos^k cos / |x - P|²."""
-
-        def image(array: np.ndarray) -> torch.Tensor:
-            return torch.from_numpy(np.ascontiguousarray(array.reshape(len(t), -1).T))[None, :, None, :].double()
-
-        total = np.zeros(len(t))
+        total = torch.zeros_like(t)
         for lamp in LAMPS_MM:
-            light = replace(self.light, position_mm=lamp).terms(torch.float64)
-            reach, towards = light_distance(image(t), image(rays), light)
-            cosine = (-towards * image(normals)).sum(1, keepdim=True).clamp(min=0)
+            light = LightTerms(*(term.to(self.device) for term in replace(self.light, position_mm=lamp).terms()))
+            reach, towards = light_distance(t[:, None, None], rays[:, :, None], light)
+            cosine = (-towards * normals[:, :, None]).sum(1, keepdim=True).clamp(min=0)
             fading = towards[:, 2:].clamp(min=0) ** self.lamp_power
-            total += (fading * cosine / reach.square().clamp(min=1e-12)).numpy().ravel()
+            total += (fading * cosine / reach.square().clamp(min=1e-12))[:, 0, 0]
         return total / len(LAMPS_MM)
 
     @staticmethod
@@ -127,25 +131,22 @@ class VariantTube(Tube):
 
     @staticmethod
     def _expose(
-        linear: np.ndarray,
-        seen: np.ndarray,
-        ray_z: np.ndarray,
-        flow: np.ndarray | None,
+        linear: Tensor,
+        seen: Tensor,
+        ray_z: Tensor,
+        flow: Tensor | None,
         sensor: Sensor,
         rng: np.random.Generator,
-        own: np.random.Generator,
+        owns: Sequence[np.random.Generator],
     ) -> np.ndarray:
         """Exposure on the mean, x / (1 + x), then sRGB's curve: linear near black, power 2.4 above; noise."""
-        image = np.zeros(linear.shape, np.float32)
-        if not seen.any():
-            return image
-        pixels = linear[seen]
-        pixels = pixels * own.uniform(0.5, 1.1) / np.quantile(pixels.max(-1), 0.75)
+        exposure = linear.new_tensor([own.uniform(0.5, 1.1) for own in owns]).reshape(-1, 1, 1, 1)
+        pixels = linear * exposure / quantiles(linear.amax(1), seen, 0.75).clamp(min=1e-12)
         pixels = 1.9 * pixels / (1 + pixels)
-        code = np.where(pixels <= 0.0031308, 12.92 * pixels, 1.055 * pixels.clip(min=1e-6) ** (1 / 2.4) - 0.055)
-        code += rng.normal(0, 0.006, code.shape)
-        image[seen] = np.round(code.clip(0, 1) * 255) / 255
-        return image
+        code = torch.where(pixels <= 0.0031308, 12.92 * pixels, 1.055 * pixels.clamp(min=1e-6) ** (1 / 2.4) - 0.055)
+        code = code + on_pixels(seen, lambda _, count: rng.normal(0, 0.006, (count, 3)))
+        image = (code.clamp(0, 1) * 255).round() / 255 * seen[:, None]
+        return image.permute(0, 2, 3, 1).cpu().numpy()
 
 
 def _section(phi: np.ndarray, rng: np.random.Generator) -> np.ndarray:
