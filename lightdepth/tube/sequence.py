@@ -14,7 +14,7 @@ from lightdepth.tube.casting import rendering_device
 from lightdepth.tube.path import camera_path, lens, octagon
 from lightdepth.tube.scene import Tube, TubeConfig
 
-_PIXELS_AT_ONCE = {"cpu": 100_000, "cuda": 4_000_000}  # beyond, a CPU's caches overflow, and a small GPU's memory
+_PIXELS_AT_ONCE = {"cpu": 500_000, "cuda": 4_000_000}  # some 200 MB, and 2 GB
 
 
 @dataclass(frozen=True)
