@@ -2,9 +2,11 @@
 
 Notation: d distance from the camera centre to the surface, r unit viewing ray, x = d r; P light position, D its unit
 direction, l = (x - P) / |x - P|, mu its spread; n unit normal, cos = n · (-l); rho albedo in [0, 1]; gain g.
-Radiance is linear; `encode` applies the response of gamma. Images are (B, C, H, W), light terms (B, 1, 1, 1).
+Radiance is linear; `encode` applies the response of gamma, `bent` the tone curve's shoulder. Images are (B, C, H, W),
+light terms (B, 1, 1, 1).
 
-    linear = g · rho · exp(-mu (1 - D · l)) · cos^q / |x - P|²  +  g · rho · indirect,      image = linear^(1/gamma)
+    linear = g · (rho · (exp(-mu (1 - D · l)) · cos^q / |x - P|²  +  indirect) + ambient)
+    image  = min(bent(linear^(1/gamma)), 1)
 
 1/pi and the light's radiance are absorbed by the unit of d: with gain 1, a white wall that faces the light on its axis
 is exactly white at distance 1.
@@ -135,10 +137,20 @@ def render(
     light: LightTerms,
     indirect: Tensor | float = 0.0,
     cosine_exponent: float = 1.0,
+    ambient: Tensor | float = 0.0,
+    shoulder: float = 1.0,
+    saturate: bool = False,
 ) -> Tensor:
-    """The encoded image (B, C, H, W), not clipped: values above 1 are what the sensor would saturate."""
+    """The encoded image (B, C, H, W). Without `saturate` it is not clipped: values above 1 are what the sensor would
+    saturate.
+
+    `indirect` is light from the wall on the wall (lightdepth.radiosity), `ambient` what reaches the sensor without the
+    wall's colour, such as stray light in the lens: both in units of irradiance. `shoulder` is the code from which the
+    tone curve bends, 1 for none.
+    """
     direct = irradiance(distance, normals, rays, light, cosine_exponent)
-    return encode(light.gain * albedo * (direct + indirect), light.gamma)
+    code = bent(encode(light.gain * (albedo * (direct + indirect) + ambient), light.gamma), shoulder)
+    return code.clamp(max=1) if saturate else code
 
 
 def encode(linear: Tensor, gamma: Tensor | float) -> Tensor:
@@ -150,6 +162,28 @@ def encode(linear: Tensor, gamma: Tensor | float) -> Tensor:
 def decode(image: Tensor, gamma: Tensor | float) -> Tensor:
     """Code values to linear radiance: v^gamma."""
     return image.clamp(min=0) ** gamma
+
+
+_REACH = 1.15
+"""How far above the shoulder s the tone curve ends, over 1 - s: it passes 1, so that sensors saturate."""
+
+
+def bent(code: Tensor, shoulder: float) -> Tensor:
+    """The end of a tone curve: codes above the shoulder s become s + 1.15 (1 - s) (1 - exp(-(code - s) / (1 - s)))."""
+    if shoulder >= 1:
+        return code
+    room = 1 - shoulder
+    excess = (code - shoulder).clamp(min=0)
+    return torch.where(excess > 0, shoulder + room * (_REACH - _REACH * (-excess / room).exp()), code)
+
+
+def straightened(code: Tensor, shoulder: float) -> Tensor:
+    """The inverse of `bent`; where a code is above what the curve reaches, a large number."""
+    if shoulder >= 1:
+        return code
+    room = 1 - shoulder
+    left = (1 - (code - shoulder).clamp(min=0) / (_REACH * room)).clamp(min=1e-3)
+    return torch.where(code > shoulder, shoulder - room * left.log(), code)
 
 
 def brightness(image: Tensor) -> Tensor:

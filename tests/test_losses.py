@@ -32,7 +32,7 @@ from lightdepth.losses import (
     training_loss,
     uncertainty_loss,
 )
-from lightdepth.photometry import LightTerms, PhotometricCalibration, encode, hue_saturation_albedo
+from lightdepth.photometry import LightTerms, PhotometricCalibration, bent, encode, hue_saturation_albedo
 
 LAMBERT = LossConfig(cosine_exponent=1.0, reflectance=0.0, cosine_floor=0.0)
 
@@ -57,9 +57,10 @@ def tube_batch(height: int = 32, width: int = 40, gain: float = 1.0, config: Los
     mask = torch.ones(batch, 1, height, width, dtype=torch.bool)
     colour = torch.tensor([0.55, 0.4]).reshape(1, 2, 1, 1).expand(batch, 2, height, width)
     indirect = indirect_light(distance, rays, mask, light, config)
-    log_v = rendered_log_brightness(distance, normals_from_distance(distance, rays), rays, light, indirect, config)
+    normals = normals_from_distance(distance, rays)
+    log_v = rendered_log_brightness(distance, normals, rays, mask, light, indirect, config)
     image = log_v.exp() * encode(hue_saturation_albedo(colour), light.gamma) * gain ** (1 / 2.2)
-    return FrameBatch(image.clamp(0, 1), mask, rays, light, distance, mask), colour
+    return FrameBatch(bent(image, config.shoulder).clamp(0, 1), mask, rays, light, distance, mask), colour
 
 
 def spoilt(distance: torch.Tensor) -> torch.Tensor:
@@ -214,7 +215,7 @@ def test_gradient_of_the_direct_model_agrees_with_differences():
         distance = log_distance.exp()
         normals = normals_from_distance(distance, double.rays)
         indirect = indirect_light(distance, double.rays, double.mask, double.light, LAMBERT)
-        return rendered_log_brightness(distance, normals, double.rays, double.light, indirect, LAMBERT)
+        return rendered_log_brightness(distance, normals, double.rays, double.mask, double.light, indirect, LAMBERT)
 
     log_distance = double.true_distance.log() + 0.05 * torch.sin(torch.arange(20).reshape(1, 1, 4, 5))
     assert torch.autograd.gradcheck(residual, log_distance.double().requires_grad_())
@@ -264,6 +265,17 @@ def test_in_every_space_truth_has_no_photometric_error_and_a_wrong_distance_has(
     right = self_supervised_loss(at_gain, colour, batch, config)[1]["photometric"]
     wrong = self_supervised_loss(spoilt(at_gain), colour, batch, config)[1]["photometric"]
     assert right < 2e-3 and wrong > 20 * right
+
+
+@pytest.mark.parametrize("known", [{"ambient": 0.2}, {"shoulder": 0.4}, {"ambient": 0.2, "shoulder": 0.4}])
+def test_stray_light_and_a_tone_curve_that_are_known_do_no_harm(known):
+    config = replace(LAMBERT, **known)
+    batch, colour = tube_batch(gain=4.0, config=config)
+    right, unaware = (
+        self_supervised_loss(batch.true_distance, colour, batch, c)[1]["photometric"] for c in (config, LAMBERT)
+    )
+    assert right < 5e-3 and unaware > 20 * right
+    assert (render_image(batch.true_distance, colour, batch, config) - batch.image).abs().max() < 0.01
 
 
 def test_with_the_gain_fixed_the_loss_gives_distance_its_scale():
@@ -366,7 +378,10 @@ def test_the_log_error_has_no_scale_and_is_zero_where_there_is_no_truth():
     assert (log_error(spoilt(batch.true_distance), batch.true_distance, valid)[..., :5] == 0).all()
 
 
-@pytest.mark.parametrize("values", [{"space": "hsv"}, {"gain": "two"}, {"smoothness": -1.0}, {"huber": -0.1}])
+@pytest.mark.parametrize(
+    "values",
+    [{"space": "hsv"}, {"gain": "two"}, {"smoothness": -1.0}, {"huber": -0.1}, {"ambient": -0.1}, {"shoulder": 1.2}],
+)
 def test_a_loss_that_makes_no_sense_is_refused(values):
     with pytest.raises(InputError, match="loss"):
         LossConfig(**values)
@@ -400,8 +415,12 @@ def gradcheck_inputs():
         replace(PAPER, photometric=0.0, specular=1.0, white=0.5),
         replace(PAPER, photometric=0.0, saturated=1.0, white=0.5),
         replace(PAPER, photometric=0.0, supervised=1.0),
+        replace(LAMBERT, smoothness=0.0, chroma=0.0, ambient=0.3, shoulder=0.5),
     ],
-    ids=["log", "smoothness", "chroma", "paper", "linear", "ssim", "facing", "specular", "saturated", "supervised"],
+    ids=[
+        *("log", "smoothness", "chroma", "paper", "linear", "ssim", "facing", "specular", "saturated", "supervised"),
+        "ambient and shoulder",
+    ],
 )
 def test_gradients_of_every_term_are_right(config):
     log_distance, albedo, batch = gradcheck_inputs()

@@ -14,6 +14,7 @@ from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
 from lightdepth.photometry import (
     PhotometricCalibration,
+    bent,
     brightness,
     decode,
     encode,
@@ -21,6 +22,7 @@ from lightdepth.photometry import (
     irradiance,
     light_distance,
     render,
+    straightened,
 )
 
 SMALL = Pinhole(5, 4, 4.0, 4.5, 2.6, 1.9)
@@ -33,7 +35,9 @@ def random_albedo(height: int, width: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(1, 3, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def slow_pixel(distance, ray, normal, albedo, light: PhotometricCalibration, indirect=0.0, exponent=1.0) -> float:
+def slow_pixel(
+    distance, ray, normal, albedo, light: PhotometricCalibration, indirect=0.0, exponent=1.0, ambient=0.0, shoulder=1.0
+) -> float:
     """One pixel, one channel, with scalars only, as the module's docstring writes it."""
     x = [distance * r for r in ray]
     towards = [a - p for a, p in zip(x, light.position_mm, strict=True)]
@@ -42,7 +46,10 @@ def slow_pixel(distance, ray, normal, albedo, light: PhotometricCalibration, ind
     aligned = sum(a * b for a, b in zip(towards, light.direction, strict=True))
     cosine = max(0.0, -sum(a * b for a, b in zip(towards, normal, strict=True)))
     direct = math.exp(-light.mu * (1 - aligned)) * cosine**exponent / length**2
-    return max(0.0, light.gain * albedo * (direct + indirect)) ** (1 / light.gamma)
+    code = max(0.0, light.gain * (albedo * (direct + indirect) + ambient)) ** (1 / light.gamma)
+    if code <= shoulder or shoulder == 1:
+        return code
+    return shoulder + 1.15 * (1 - shoulder) * (1 - math.exp(-(code - shoulder) / (1 - shoulder)))
 
 
 @pytest.mark.parametrize("light", [PhotometricCalibration(gain=50.0), ENDOSCOPE], ids=["co-located", "offset"])
@@ -57,6 +64,32 @@ def test_rendering_agrees_with_a_slow_scalar_reference(light, exponent):
             args = float(scene.distance[0, 0, row, column]), scene.rays[here].tolist(), scene.normals[here].tolist()
             expected = [slow_pixel(*args, float(a), light, 0.002, exponent) for a in albedo[here]]
             np.testing.assert_allclose(image[here], expected, rtol=1e-5 if exponent != 1 else 1e-10)
+
+
+def test_stray_light_the_shoulder_and_white_agree_with_the_slow_reference():
+    scene, albedo, light = slanted_plane(SMALL), random_albedo(4, 5), PhotometricCalibration(gain=6000.0)
+    parts = scene.distance, scene.normals, scene.rays, albedo, light.terms(torch.float64), 0.0, 1.0, 2e-5
+    image, clipped = render(*parts, shoulder=0.6), render(*parts, shoulder=0.6, saturate=True)
+    assert image.min() < 0.6 and image.max() > 1  # or this would prove nothing
+    assert torch.equal(clipped, image.clamp(max=1)) and not torch.allclose(image, render(*parts))
+    for row in range(4):
+        for column in range(5):
+            here = (0, slice(None), row, column)
+            args = float(scene.distance[0, 0, row, column]), scene.rays[here].tolist(), scene.normals[here].tolist()
+            expected = [slow_pixel(*args, float(a), light, 0.0, 1.0, 2e-5, 0.6) for a in albedo[here]]
+            np.testing.assert_allclose(image[here], expected, rtol=1e-10)
+
+
+def test_a_tone_curve_is_straightened_again_and_has_gradients_everywhere():
+    code = torch.linspace(0, 1.4, 57, dtype=torch.float64).requires_grad_()
+    curved = bent(code, 0.7)
+    assert torch.equal(curved[code <= 0.7], code[code <= 0.7]) and (curved.diff() > 0).all()
+    assert curved.max() < 0.7 + 1.15 * 0.3
+    torch.testing.assert_close(straightened(curved, 0.7), code)
+    assert torch.equal(bent(code, 1.0), code) and torch.equal(straightened(code, 1.0), code)
+    assert straightened(torch.tensor([2.0]), 0.7).isfinite().all()
+    slope = torch.autograd.grad(bent(code, 0.7).sum() + straightened(curved, 0.7).sum(), code)[0]
+    assert slope.isfinite().all() and (slope > 0).all()
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -32,6 +32,9 @@ class LossConfig:
         reflectance: of the wall, for the indirect light; null takes each image's calibrated value.
         cosine_exponent: q of cos^q; the cosine is weaker in endoscopes than Lambert's 1.
         cosine_floor: cosines below are rendered as this.
+        ambient: light on every pixel that is not the wall's, such as stray light in the lens, as a share of the mean
+            light that is rendered.
+        shoulder: code from which the camera's tone curve bends; seen images are straightened from there. 1 is none.
         huber: where the photometric term turns from square to linear, in its space; 0 is L1.
         white: brightness from which a pixel counts as saturated.
         bounces: of the indirect light.
@@ -54,6 +57,8 @@ class LossConfig:
     reflectance: float | None = 0.6
     cosine_exponent: float = 0.5
     cosine_floor: float = 0.03
+    ambient: float = 0.0
+    shoulder: float = 1.0
     huber: float = 0.05
     white: float = 0.97
     bounces: int = 3
@@ -68,6 +73,10 @@ class LossConfig:
         ]
         if negative or self.huber < 0:
             raise InputError(f"loss {', '.join(negative) or 'huber'} below 0; expected weights of at least 0")
+        if self.ambient < 0 or not 0.2 <= self.shoulder <= 1:
+            raise InputError(
+                f"loss ambient {self.ambient}, shoulder {self.shoulder}; expected at least 0, and .2 to 1"
+            )
 
 
 TERMS = ("photometric", "ssim", "saturated", "specular", "facing", "smoothness", "chroma", "albedo")

@@ -3,7 +3,9 @@
 Notation: t distance along the unit ray r, n normal, cos = -n · r; V = max(R, G, B), fall = exp(-mu (1 - cos psi)), E
 indirect light (lightdepth.radiosity), gamma the response, rho albedo of value 1, g gain. Rendered:
 
-    log V' = log(fall · max(cos, floor)^q / t² + E) / gamma,        I' = V' · rho^(1/gamma)
+    log V' = log(fall · max(cos, floor)^q / t² + E + A) / gamma,        I' = V' · rho^(1/gamma)
+
+A is ambient light: a share of the image's mean of the rest. V is seen with the tone curve's shoulder straightened.
 """
 
 from __future__ import annotations
@@ -39,12 +41,24 @@ def indirect_light(distance: Tensor, rays: Tensor, mask: Tensor, light: LightTer
 
 
 def rendered_log_brightness(
-    distance: Tensor, normals: Tensor, rays: Tensor, light: LightTerms, indirect: Tensor, config: LossConfig
+    distance: Tensor,
+    normals: Tensor,
+    rays: Tensor,
+    mask: Tensor,
+    light: LightTerms,
+    indirect: Tensor,
+    config: LossConfig,
 ) -> Tensor:
-    """log(fall · max(cos, floor)^q / t² + E) / gamma, the log brightness of a wall of value 1. (B, 1, H, W)"""
+    """log(fall · max(cos, floor)^q / t² + E + A) / gamma, the log brightness of a wall of value 1. (B, 1, H, W)
+
+    The mean that A is a share of is over the mask (B, 1, H, W).
+    """
     light = light.co_located()
-    direct = irradiance(distance, normals, rays, light, config.cosine_exponent, config.cosine_floor)
-    return (direct + indirect).clamp(min=1e-12).log() / light.gamma
+    lit = irradiance(distance, normals, rays, light, config.cosine_exponent, config.cosine_floor) + indirect
+    if config.ambient > 0:
+        inside = torch.where(mask, lit, 0.0).sum((2, 3), keepdim=True) / mask.sum((2, 3), keepdim=True).clamp(min=1)
+        lit = lit + config.ambient * inside
+    return lit.clamp(min=1e-12).log() / light.gamma
 
 
 def brightness_residual(log_seen: Tensor, log_rendered: Tensor, usable: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from lightdepth.losses import light as lit
 from lightdepth.losses import surface, truth
 from lightdepth.losses.config import LossConfig
 from lightdepth.losses.masked import masked_median
-from lightdepth.photometry import brightness
+from lightdepth.photometry import bent, brightness, straightened
 
 _V_FLOOR = 1e-2
 
@@ -32,7 +32,7 @@ class Seen:
     @classmethod
     def of(cls, batch: FrameBatch, config: LossConfig) -> Seen:
         v = brightness(batch.image)
-        log_v = v.clamp(min=_V_FLOOR).log()
+        log_v = straightened(v, config.shoulder).clamp(min=_V_FLOOR).log()
         saturated = batch.mask & (v >= config.white)
         usable = informative(batch.image, batch.mask) & ~saturated
         return cls(log_v, saturated, usable, surface.smoothness_guide(log_v, batch.mask))
@@ -58,9 +58,10 @@ def self_supervised_loss(
         indirect = lit.indirect_light(distance, rays, mask, light, config)
 
     normals = normals_from_distance(distance, rays)
-    log_rendered = lit.rendered_log_brightness(distance, normals, rays, light, indirect, config)
+    log_rendered = lit.rendered_log_brightness(distance, normals, rays, mask, light, indirect, config)
     free = config.gain == "free"
     residual = lit.brightness_residual(seen.log_v, log_rendered, seen.usable) if free else seen.log_v - log_rendered
+    image = straightened(image, config.shoulder)
     compared, rendered = residual, image
     if config.space != "log" or config.ssim > 0:
         if albedo_hs is None:
@@ -104,11 +105,12 @@ def training_loss(
 
 
 def render_image(distance: Tensor, albedo_hs: Tensor, batch: FrameBatch, config: LossConfig) -> Tensor:
-    """The image as the loss renders it, its gain matched to the one seen and clipped at white. (B, 3, H, W)"""
+    """The image as the loss renders it, its gain matched to the one seen, bent by the tone curve and clipped at white.
+    (B, 3, H, W)"""
     normals = normals_from_distance(distance, batch.rays)
     indirect = lit.indirect_light(distance, batch.rays, batch.mask, batch.light, config)
-    log_rendered = lit.rendered_log_brightness(distance, normals, batch.rays, batch.light, indirect, config)
-    v = brightness(batch.image)
-    usable = informative(batch.image, batch.mask) & (v < config.white)
-    gain = masked_median(v.clamp(min=_V_FLOOR).log() - log_rendered, usable)
-    return lit.rendered_rgb(log_rendered + gain, albedo_hs, batch.light.gamma).clamp(max=1) * batch.mask
+    log_rendered = lit.rendered_log_brightness(distance, normals, batch.rays, batch.mask, batch.light, indirect, config)
+    seen = Seen.of(batch, config)
+    gain = masked_median(seen.log_v - log_rendered, seen.usable)
+    rendered = lit.rendered_rgb(log_rendered + gain, albedo_hs, batch.light.gamma)
+    return bent(rendered, config.shoulder).clamp(max=1) * batch.mask

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
-from lightdepth.photometry import encode
+from lightdepth.photometry import bent, encode
 
 
 @dataclass(frozen=True)
@@ -144,10 +144,7 @@ def expose(
     if sensor.contrast != 0:
         mid = code.clamp(0, 1)
         code = code + sensor.contrast * mid * (1 - mid) * (2 * mid - 1)
-    bend = max(1 - sensor.shoulder, 1e-3)
-    excess = (code - sensor.shoulder).clamp(min=0)
-    code = torch.where(excess > 0, sensor.shoulder + bend * (1.15 - 1.15 * (-excess / bend).exp()), code)
-    image = (code + noise) * inside
+    image = (bent(code, sensor.shoulder) + noise) * inside
     if sensor.sharpen > 0:
         image = image + sensor.sharpen * (image - _blurred(image, inside, 0.006 * height))
     image = (image.clamp(0, 1) * 255).round() / 255 * inside
