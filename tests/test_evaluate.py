@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from colons import colon, sequence, slam, truth
 
-from densify.cli import evaluate
+from densify.evaluate_command import evaluate
 from densify.judge import Model, dense_models, judge_depth, judge_maps, read_run, read_truth
 from densify.pipeline import DensifyConfig, densify
 from densify.suite import alone

@@ -1,0 +1,124 @@
+"""What `densify`, `demo` and `evaluate --checkpoint` make of frames and a sparse map, and how a run folder holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+
+from densify.merge import MergeConfig, Merged, joined_name, merge
+from densify.page import Gallery
+from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, densify
+from lightdepth.checkpoint import load_model
+from lightdepth.datasets import FrameSequence
+from lightdepth.errors import InputError
+from lightdepth.predict import DepthModel
+from lightdepth.progress import Progress
+from lightdepth.run import Run, plain
+from lightdepth.sparse_map import SparseMap
+
+
+@dataclass
+class Densified:
+    """The densify step as verbs use it: results, the same with a constant distance, pictures taken on the way."""
+
+    model: str
+    results: Sequence[SubmapResult]
+    baselines: Sequence[SubmapResult]
+    gallery: Gallery
+    merged: Merged | None = None
+
+    @classmethod
+    def make(
+        cls,
+        frames: FrameSequence,
+        sparse_map: SparseMap,
+        model: DepthModel,
+        config: DensifyConfig,
+        merging: MergeConfig | None = None,
+    ) -> Densified:
+        gallery = Gallery(sparse_map)
+        count = sum(len(s.keyframes) for s in sparse_map.submaps)
+        with Progress("Densifying", count) as bar:
+
+            def show(view: KeyframeView) -> None:
+                gallery(view)
+                bar.advance()
+
+            results = densify(frames, sparse_map, model, config, show)
+        baselines: Sequence[SubmapResult] = []
+        if config.withhold:
+            with Progress("Constant distance, for comparison", count) as bar:
+                # At one scale per keyframe: bent to the points of the map, a constant would be the map's merit.
+                rigid = replace(config, agreement=replace(config.agreement, on=False))
+                baselines = densify(frames, sparse_map, load_model("constant"), rigid, lambda _: bar.advance())
+        merged = None
+        if merging is not None and len(results) > 1:
+            with Progress("Joining submaps", count) as bar:
+                merged = merge(results, frames, model, config, merging, lambda _: bar.advance())
+        return cls(model.name, results, baselines, gallery, merged)
+
+    def write(self, run: Run, formats: tuple[str, ...], mm_per_unit: float | None) -> None:
+        """Every surface's folder, its figures in run.json and a line for the user. Raises InputError when none was
+        made."""
+        made = [r for r in self.results if len(r.dense.triangles)]
+        if not made:
+            reasons = [f"{a.keyframe}: {a.reason}" for r in self.results for a in r.dense.alignments if not a.ok]
+            raise InputError(f"no keyframe of any map could be aligned; {'; '.join(reasons[:3])}")
+        constant = {b.dense.submap.id: b for b in self.baselines}
+        records = []
+        for result in self.results:
+            dense, withheld = result.dense, result.withheld
+            name = f"map_{dense.submap.id:03d}"
+            baseline = constant.get(dense.submap.id)
+            records.append(
+                {
+                    "map": dense.submap.id,
+                    "keyframes": len(dense.alignments),
+                    "aligned": len(dense.aligned),
+                    "vertices": len(dense.vertices),
+                    "voxel": dense.voxel,
+                    "seen_share": result.seen_share,
+                    "coverage": result.coverage and result.coverage.scaled(mm_per_unit or 1.0).record(),
+                    "withheld": withheld and asdict(withheld),
+                    "withheld_constant": baseline and baseline.withheld and asdict(baseline.withheld),
+                    "seconds": result.seconds,
+                }
+            )
+            for keyframe, reason in result.unread.items():
+                run.fail(f"{name}, keyframe {keyframe}", reason)
+            if not len(dense.triangles):
+                run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
+                continue
+            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, mm_per_unit)
+            text = f"{name}: {len(dense.aligned)} of {len(dense.alignments)} keyframes aligned, "
+            text += f"{len(dense.vertices)} vertices"
+            if withheld is not None:
+                text += f"; withheld points {_share(withheld.median)} from the surface"
+                if baseline is not None and baseline.withheld is not None:
+                    text += f" (constant distance {_share(baseline.withheld.median)})"
+            if result.coverage is not None:
+                text += f"; {result.coverage.well_share:.0%} of the wall seen well, {len(result.coverage.holes)} holes"
+            run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
+        if self.merged is not None:
+            self._write_joined(run, self.merged, formats, mm_per_unit)
+        run.record.update(
+            {"unit": "mm" if mm_per_unit else "map units", "checkpoint": self.model, "maps": plain(records)}
+        )
+
+    def _write_joined(self, run: Run, merged: Merged, formats: tuple[str, ...], mm_per_unit: float | None) -> None:
+        run.record["merge"] = plain(merged.record(mm_per_unit or 1.0))
+        for result, group in zip(merged.results, merged.groups, strict=True):
+            dense, name = result.dense, joined_name(result)
+            if not len(dense.triangles):
+                run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
+                continue
+            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, mm_per_unit)
+            maps = ", ".join(map(str, sorted(group)))
+            text = f"{name}: maps {maps} in one, in the unit of map {next(iter(group))}, "
+            run.log(f"{text}{len(dense.aligned)} of {len(dense.alignments)} keyframes aligned")
+        for map_id, reason in merged.meeting.alone().items():
+            run.log(f"map {map_id} joins no other: {reason}")
+
+
+def _share(value: float) -> str:
+    return f"{value:.1%}" if value < float("inf") else "infinitely far"
