@@ -21,9 +21,9 @@ from densify.densified import Densified
 from densify.doctor import examine
 from densify.fusion import FusionConfig
 from densify.inputs import fitted_light, made_sparse, map_and_frames
+from densify.joining import MergeConfig
 from densify.judge import dense_models, judge_maps, read_run, read_truth
 from densify.measure import chosen_map, measured, places_in_frame, run_unit, summary
-from densify.merge import MergeConfig
 from densify.page import densify_page, joined_section
 from densify.pipeline import DensifyConfig
 from densify.play import play, time_spent, timings_picture, write_timings

@@ -9,7 +9,7 @@ import numpy as np
 
 from densify.coverage import seen_well
 from densify.dense_map import DenseMap
-from densify.merge import Merged, joined_name
+from densify.joining import Merged, joined_name
 from densify.pipeline import KeyframeView, SubmapResult
 from lightdepth.figures import (
     BAD,

@@ -1,0 +1,73 @@
+"""The submaps of a run, joined and made dense as one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from densify.evaluation import Similarity
+from densify.joining.join import Join, MergeConfig
+from densify.joining.meeting import Meeting, join_maps
+from densify.joining.submap import joined_submap
+from densify.pipeline import DensifyConfig, KeyframeView, Model, SubmapResult, densify
+from lightdepth.datasets import FrameSequence
+from lightdepth.sparse_map import SparseMap
+
+
+@dataclass(frozen=True)
+class Merged:
+    """How the submaps met, and the surface of each group of several, its submap numbered by its place in `results`."""
+
+    meeting: Meeting
+    results: tuple[SubmapResult, ...]
+
+    @property
+    def groups(self) -> list[dict[int, Similarity]]:
+        return [g for g in self.meeting.groups if len(g) > 1]
+
+    def record(self, unit: float = 1.0) -> dict[str, Any]:
+        """For run.json. A transform is as `evaluate --join` reads it: X_second = scale · rotation X_first +
+        translation, where a map's unit is written as `unit`."""
+        joined = []
+        for result, group in zip(self.results, self.groups, strict=True):
+            first = next(iter(group))
+            transforms = [{"first": i, "second": first, **_numbers(s, unit)} for i, s in group.items() if i != first]
+            joined.append({"folder": joined_name(result), "maps": list(group), "unit_of": first})
+            joined[-1]["transforms"] = transforms
+        joins = [{**asdict(replace(j, target_from_source=None)), "ok": j.ok} for j in self.tried]
+        return {"joined": joined, "joins": joins, "alone": self.meeting.alone()}
+
+    @property
+    def tried(self) -> tuple[Join, ...]:
+        return *self.meeting.joins, *self.meeting.refused
+
+
+def joined_name(result: SubmapResult) -> str:
+    return f"joined_{result.dense.submap.id:03d}"
+
+
+def _numbers(s: Similarity, unit: float) -> dict[str, Any]:
+    return {"scale": s.scale, "rotation": s.rotation.tolist(), "translation": (unit * s.translation).tolist()}
+
+
+def merge(
+    results: Sequence[SubmapResult],
+    frames: FrameSequence,
+    model: Model,
+    recipe: DensifyConfig,
+    config: MergeConfig,
+    on_keyframe: Callable[[KeyframeView], None] | None = None,
+) -> Merged:
+    """Joins the submaps of a run, and makes each group of several dense as one."""
+    rng = np.random.default_rng([recipe.seed, 2])
+    by_id = {r.dense.submap.id: r.dense.submap for r in results}
+    meeting = join_maps([r.dense for r in results], frames, config, rng)
+    groups = [g for g in meeting.groups if len(g) > 1]
+    submaps = tuple(joined_submap([by_id[i] for i in g], g, k, config) for k, g in enumerate(groups))
+    if not submaps:
+        return Merged(meeting, ())
+    joined = densify(frames, SparseMap(submaps, "joined maps"), model, recipe, on_keyframe)
+    return Merged(meeting, tuple(joined))
