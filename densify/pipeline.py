@@ -200,7 +200,7 @@ def _look(
     keyframe: Keyframe, submap: Submap, frames: FrameSequence, model: Model, config: DensifyConfig, clock: _Clock
 ) -> _Look:
     with clock("read"):
-        frame, reason = _frame_of(keyframe, frames)
+        frame, reason = frame_of(keyframe, frames)
     if frame is None:
         return _Look(keyframe, Alignment(keyframe.name, reason=reason))
     with clock("predict"):
@@ -219,7 +219,7 @@ def _look(
 def _again(look: _Look, frames: FrameSequence, model: Model, clock: _Clock) -> _Look:
     """A keyframe whose image and prediction were not kept."""
     with clock("read"):
-        frame, reason = _frame_of(look.keyframe, frames)
+        frame, reason = frame_of(look.keyframe, frames)
     if frame is None:  # readable a moment ago
         return replace(look, alignment=Alignment(look.keyframe.name, reason=reason), view=None)
     with clock("predict"):
@@ -275,7 +275,7 @@ class _Fusion:
         return replace(made, weights=mesh.weights, views=mesh.views)
 
 
-def _frame_of(keyframe: Keyframe, frames: FrameSequence) -> tuple[Frame | None, str]:
+def frame_of(keyframe: Keyframe, frames: FrameSequence) -> tuple[Frame | None, str]:
     """The image of a keyframe with the map's own camera, which knows best; or None and the reason."""
     try:
         frame = frames.by_number(keyframe.number)
@@ -343,7 +343,7 @@ def seen_share(dense: DenseMap, keyframes: Sequence[Keyframe], frames: FrameSequ
     """Share of the masked pixels of keyframes whose rays meet the surface (every stride-th pixel each way)."""
     hits = total = 0
     for keyframe in keyframes:
-        frame, _ = _frame_of(keyframe, frames)
+        frame, _ = frame_of(keyframe, frames)
         assert frame is not None
         rows, columns = frame.valid[::stride, ::stride].nonzero()
         rays = keyframe.camera.rays()[0][::stride, ::stride][rows, columns]

@@ -17,7 +17,7 @@ import numpy as np
 
 from densify.dense_map import DenseMap
 from densify.live import STEPS, Densifier, StepTime
-from densify.pipeline import DensifyConfig, Model, _frame_of
+from densify.pipeline import DensifyConfig, Model, frame_of
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.figures import chart, chart_png
@@ -87,7 +87,7 @@ def _play_one(
     densifier: Densifier, submap: Submap, keyframe: Keyframe, frames: FrameSequence, arrival: float, start: float
 ) -> Played:
     wall, cpu = time.perf_counter(), time.process_time()
-    frame, reason = _frame_of(keyframe, frames)
+    frame, reason = frame_of(keyframe, frames)
     densifier.times = {"read": StepTime(time.perf_counter() - wall, time.process_time() - cpu)}
     if frame is not None:
         rows, there = submap.rows_of(keyframe.point_ids)
