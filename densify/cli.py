@@ -23,6 +23,7 @@ from densify.fusion import FusionConfig
 from densify.inputs import fitted_light, made_sparse, map_and_frames
 from densify.joining import MergeConfig
 from densify.judge import dense_models, judge_maps, read_run, read_truth
+from densify.live import LIVE_FUSION
 from densify.measure import chosen_map, measured, places_in_frame, run_unit, summary
 from densify.page import densify_page, joined_section
 from densify.pipeline import DensifyConfig
@@ -147,7 +148,7 @@ def live(
     agreement: AgreementConfig = AgreementConfig(),
     bending: BendingConfig = BendingConfig(),
     rectify: RectifyConfig = RectifyConfig(),
-    fusion: FusionConfig = FusionConfig(),
+    fusion: FusionConfig = LIVE_FUSION,
     coverage: CoverageConfig = CoverageConfig(),
     sfm: SfmConfig = SfmConfig(),
     mm_per_unit: float | None = None,

@@ -22,7 +22,7 @@ from densify.agreement import View, agree
 from densify.alignment import Alignment, align, bent
 from densify.coverage import contribution, looked_at
 from densify.dense_map import Contribution, DenseMap
-from densify.fusion import TsdfVolume
+from densify.fusion import FusionConfig, TsdfVolume
 from densify.marching import BlockSurface, Patch, joined
 from densify.marching_cubes import unpacked
 from densify.packed import PackedView, packed_view
@@ -39,6 +39,10 @@ from lightdepth.sparse_map import Keyframe, Submap
 
 STEPS = ("predict", "align", "integrate", "extract")
 """What a keyframe's time goes into, the paper's own split."""
+
+LIVE_FUSION = FusionConfig(voxels_per_distance=35.0)
+"""Two thirds as fine as densify's, for two thirds of the time. On six colons the surface's median error is 4 % smaller,
+its RMS 1.5 % smaller, and what lies between truth and surface 2.4 % larger than at 52 voxels."""
 
 _NEW_VOXEL = 1.25  # a map whose typical distance has changed by more, in its units, is given another voxel size
 
@@ -83,7 +87,8 @@ class _Kept:
 class Densifier:
     """One submap's surface, which grows with every keyframe. Not safe to be used by several threads at once.
 
-    `model` predicts a frame's distance; `light` and `mask` (H, W) belong to images that are given as arrays.
+    `model` predicts a frame's distance; without a `config`, voxels are those of LIVE_FUSION; `light` and `mask` (H, W)
+    belong to images that are given as arrays.
     """
 
     def __init__(
@@ -94,7 +99,7 @@ class Densifier:
         light: PhotometricCalibration | None = None,
         mask: np.ndarray | None = None,
     ):
-        self.config = config or DensifyConfig(withhold=0.0)
+        self.config = config or DensifyConfig(fusion=LIVE_FUSION, withhold=0.0)
         if self.config.recipe != "full":
             raise InputError(
                 f"recipe {self.config.recipe!r}; live there is only full: nothing leaves the paper's volume"

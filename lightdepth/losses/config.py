@@ -74,9 +74,7 @@ class LossConfig:
         if negative or self.huber < 0:
             raise InputError(f"loss {', '.join(negative) or 'huber'} below 0; expected weights of at least 0")
         if self.ambient < 0 or not 0.2 <= self.shoulder <= 1:
-            raise InputError(
-                f"loss ambient {self.ambient}, shoulder {self.shoulder}; expected at least 0, and .2 to 1"
-            )
+            raise InputError(f"loss ambient {self.ambient}, shoulder {self.shoulder}; expected at least 0, and .2 to 1")
 
 
 TERMS = ("photometric", "ssim", "saturated", "specular", "facing", "smoothness", "chroma", "albedo")

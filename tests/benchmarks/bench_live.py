@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from densify.fusion import FusionConfig
-from densify.live import STEPS, Densifier
+from densify.live import LIVE_FUSION, STEPS, Densifier
 from densify.pipeline import DensifyConfig
 from densify.play import play, time_spent
 from lightdepth.camera import CameraModel
@@ -32,7 +32,7 @@ from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 from lightdepth.tube import lens, render_sequence
 from lightdepth.tube.slam import SlamConfig, simulate_slam
 
-LIVE = DensifyConfig(withhold=0.0)
+LIVE = DensifyConfig(fusion=LIVE_FUSION, withhold=0.0)
 COARSE = replace(LIVE, fusion=FusionConfig(voxels_per_distance=26.0))
 """For the long ones, which compare times and do not state them: a quarter of the work."""
 
