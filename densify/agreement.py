@@ -30,7 +30,7 @@ from scipy.sparse.linalg import spsolve
 from densify.bending import Bend, BendingConfig
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
-from lightdepth.robust import robust_weights
+from lightdepth.robust import lower_quartile, robust_weights
 from lightdepth.sparse_map import Keyframe
 
 _STEP = 1e-3  # of log distance, to differentiate by
@@ -200,7 +200,7 @@ def _point_rows(index: int, view: View, bend: Bend, places: _Places, most: float
 def _inlier_deviation(residual: np.ndarray) -> float:
     """Standard deviation, where up to half of the residuals are wrong: from the lower quartile, which they inflate
     less than the median."""
-    return max(float(np.quantile(np.abs(residual), 0.25)) / 0.3186, _LEAST_SIGMA)
+    return max(lower_quartile(np.abs(residual)) / 0.3186, _LEAST_SIGMA)
 
 
 def _deviation(residual: np.ndarray) -> float:

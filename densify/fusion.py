@@ -63,7 +63,7 @@ class TsdfVolume:
         self.voxel = voxel
         self.views = 0
         self._config = config
-        self._slots: dict[int, int] = {}  # by packed place
+        self._held = np.zeros((2, 0), np.int64)  # packed places of all blocks, in order, and their slots
         self._free: list[int] = []
         self._codes = np.zeros(0, np.int64)
         self._above = np.full((0, 8), -1, np.int32)  # the slots of the blocks at CORNERS from each; -1 where there is
@@ -141,7 +141,8 @@ class TsdfVolume:
             self._grow(len(new))
             slots[new] = taken = [self._free.pop() for _ in range(len(new))]
             self._codes[taken] = codes[new]
-            self._slots.update(zip(codes[new].tolist(), taken, strict=True))
+            held = np.concatenate([self._held, [codes[new], taken]], 1)
+            self._held = held[:, np.argsort(held[0], kind="stable")]
             for corner, step in enumerate(_CODE_STEPS.tolist()):
                 for here, back, way in ((self._above, self._below, step), (self._below, self._above, -step)):
                     here[taken, corner] = there = self.slots(codes[new] + way)
@@ -157,9 +158,8 @@ class TsdfVolume:
                 there = here[slots, corner]
                 back[there[there >= 0], corner] = -1
         self._above[slots] = self._below[slots] = -1
-        for slot, code in zip(slots.tolist(), self._codes[slots].tolist(), strict=True):
-            del self._slots[code]
-            self._free.append(slot)
+        self._held = self._held[:, ~np.isin(self._held[1], slots)]
+        self._free += slots.tolist()
 
     def _grow(self, wanted: int) -> None:
         held = len(self._codes)
@@ -177,12 +177,16 @@ class TsdfVolume:
 
     def slots(self, codes: np.ndarray) -> np.ndarray:
         """Where blocks (n,), packed, are held (n,); -1 where there is none."""
-        return np.array([self._slots.get(code, -1) for code in codes.tolist()], np.int64)
+        places, slots = self._held
+        if not len(places):
+            return np.full(codes.shape, -1)
+        at = np.searchsorted(places, codes).clip(max=len(places) - 1)
+        return np.where(places[at] == codes, slots[at], -1)
 
     @property
     def places(self) -> np.ndarray:
         """Packed places (n,) of all blocks that hold anything, in order."""
-        return np.sort(np.fromiter(self._slots, np.int64, len(self._slots)))
+        return self._held[0].copy()
 
     def cut(self, slots: np.ndarray) -> Cut:
         """The surface in the blocks at slots (n,)."""

@@ -13,6 +13,7 @@ from lightdepth.robust import (
     LMedS,
     inlier_sigma,
     lmeds_scale,
+    lower_quartile,
     median_rank,
     refine_scale,
     robust_weights,
@@ -203,3 +204,9 @@ def test_sigma_of_gaussian_residuals_is_their_standard_deviation():
 def test_the_finite_sample_factor_is_rousseeuws_and_off_by_default():
     assert inlier_sigma(2.0, 11) == pytest.approx(2 * 1.4826)
     assert inlier_sigma(2.0, 11, finite_sample=True) == pytest.approx(2 * 1.4826 * 1.5)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 101, 500])
+def test_the_lower_quartile_is_numpys(n):
+    values = np.random.default_rng(n).standard_normal(n)
+    assert lower_quartile(values) == pytest.approx(np.quantile(values, 0.25), rel=1e-12)
