@@ -53,7 +53,7 @@ class DPT(nn.Module):
             num_attention_heads=size["heads"],
             image_size=_POSITIONS,
             patch_size=_PATCH,
-            out_features=[f"stage{i}" for i in _TAPS[size["layers"]]],
+            out_features=[f"stage{i}" for i in _TAPS[size["layers"]]],  # type: ignore[call-arg]  # known to its base
             reshape_hidden_states=False,
             apply_layernorm=True,
             use_mask_token=False,
