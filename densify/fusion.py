@@ -18,6 +18,7 @@ import numpy as np
 from densify.compiled import compiled
 from densify.marching_cubes import BLOCK, CORNERS, REACH, Cut, cut, one_vertex_an_edge, packed
 from densify.rectify import FULL, SurfaceView
+from densify.second_core import halves
 from lightdepth.errors import InputError
 
 STEPS = 2048
@@ -95,11 +96,16 @@ class TsdfVolume:
         rotation, translation = cam_from_map[:3, :3], cam_from_map[:3, 3]
         origins = (places * (BLOCK * self.voxel) @ rotation.T + translation).astype(np.float32)
         offsets = rotation.astype(np.float32) @ self._offsets
-        any_left = _add_view(
-            self._weight, self._distance, self._seen, self._color, self._behind, self._known, slots,
-            origins, offsets, view.table.look_up(origins, offsets), view.planes, view.weights, view.colors,
-            np.float32(self._config.truncation * self.voxel), np.float32(_COLORED * self.voxel), sign,
-            self._config.min_views,
+        pixels = view.table.look_up(origins, offsets)
+        any_left = np.zeros(len(slots), bool)
+        halves(
+            lambda first, end: _add_view(
+                self._weight, self._distance, self._seen, self._color, self._behind, self._known, slots,
+                origins, offsets, pixels, view.planes, view.weights, view.colors,
+                np.float32(self._config.truncation * self.voxel), np.float32(_COLORED * self.voxel), sign,
+                self._config.min_views, first, end, any_left,
+            ),
+            len(slots),
         )  # fmt: skip
         touched = np.unique(self._below[slots])
         codes = self._codes[touched[touched >= 0]]
@@ -219,19 +225,18 @@ _CODE_STEPS = packed(CORNERS) - packed(np.zeros((1, 3), int))  # to the eight co
 def _add_view(
     weight, distance, seen, color, behind, known, slots,
     origins, offsets, pixels, planes, weights, colors,
-    tau, colored, sign, least,
+    tau, colored, sign, least, first, end, any_left,
 ):  # fmt: skip
-    """Adds sign times what a view says to the sums of the blocks at slots (n,). The voxels of a block are at its
-    origin (n, 3) + offsets (3, 512), in camera axes, and in its pixels (n, 512). Which blocks (n,) hold anything then.
-    """
+    """Adds sign times what a view says to the sums of the blocks at slots (n,), first to end. The voxels of a block are
+    at its origin (n, 3) + offsets (3, 512), in camera axes, and in its pixels (n, 512). Whether a block holds anything
+    then goes into any_left (n,)."""
     # Loops of one kind each, and choices instead of min and max: so those over sums are done eight at a time.
     zero, one, sign = np.float32(0), np.float32(1), np.int32(sign)
     steps, per_tau = np.float32(STEPS) / tau, one / tau
     plane = np.empty((4, 512), np.float32)
     full, s = np.empty(512, np.float32), np.empty(512, np.float32)
     signed = np.empty(512, np.int32)
-    any_left = np.zeros(len(slots), np.bool_)
-    for i in range(len(slots)):
+    for i in range(first, end):
         slot, pixel = slots[i], pixels[i]
         for v in range(512):
             for k in range(4):
@@ -267,7 +272,6 @@ def _add_view(
             if signed[v] != 0 and abs(s[v]) < colored:
                 for k in range(4):
                     color[slot, v, k] += signed[v] * colors[pixel[v], k]
-    return any_left
 
 
 @compiled

@@ -25,7 +25,7 @@ from densify.dense_map import Contribution, DenseMap
 from densify.fusion import FusionConfig, TsdfVolume
 from densify.marching import BlockSurface, Patch, joined
 from densify.marching_cubes import unpacked
-from densify.packed import PackedView, packed_view
+from densify.packed import PackedView, Packing
 from densify.pipeline import DensifyConfig, Model, split_withheld, typical_distance
 from densify.rectify import SurfaceView, surface_view
 from lightdepth.camera import CameraModel
@@ -151,14 +151,15 @@ class Densifier:
                 "one for each point that it observed"
             )
         frame = self._frame(image, keyframe)
+        packing = Packing(frame.image)
         with self._timed("predict"):
             prediction = self._model(frame)
         with self._timed("integrate"):
-            view, prediction = packed_view(prediction, frame.image)
+            prediction = packing.round(prediction)
         with self._timed("align"):
             alignment = self._aligned(keyframe, points, prediction)
         with self._timed("integrate"):
-            self._add(_Kept(keyframe, points, view, alignment), prediction)
+            self._add(_Kept(keyframe, points, packing.done(), alignment), prediction)
         return alignment
 
     def update_poses(

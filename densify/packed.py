@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from densify.compiled import compiled
+from densify.second_core import later
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.sequence import decode, unit_range
 from lightdepth.prediction import DepthPrediction
@@ -36,7 +37,7 @@ class PackedField:
     def values(self) -> tuple[np.ndarray, np.ndarray]:
         """Values float32, 1 where invalid, and validity, both (H, W)."""
         codes = _read(np.frombuffer(self.data, np.uint8), *self.shape)
-        return _decoded(codes, self.low, self.high, self.steps)
+        return _Codes(codes, self.low, self.high, self.steps).values()
 
 
 @dataclass(frozen=True)
@@ -70,36 +71,70 @@ class PackedView:
 
 def packed_view(prediction: DepthPrediction, image: np.ndarray) -> tuple[PackedView, DepthPrediction]:
     """What is kept of a keyframe, and its prediction as it will come back. image (H, W, 3) float32 in [0, 1]."""
-    valid = prediction.valid & (prediction.distance > 0) & np.isfinite(prediction.distance)
-    distance, (rounded, valid) = _packed(prediction.distance, valid, _STEPS)
-    sigma = uncertainty = None
-    if prediction.uncertainty is not None:
-        uncertainty, (sigma, _) = _packed(prediction.uncertainty, valid & (prediction.uncertainty > 0), _FEW_STEPS)
-    pixels = cv2.convertScaleAbs(np.maximum(image, 0), alpha=255)
-    jpeg = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[
-        1
-    ].tobytes()
-    p = prediction
-    view = PackedView(p.name, p.camera, p.source, p.unit, distance, uncertainty, jpeg)
-    back = replace(p, distance=rounded, valid=valid, uncertainty=sigma, albedo=None, normals=None)
-    return view, back
+    packing = Packing(image)
+    rounded = packing.round(prediction)
+    return packing.done(), rounded
 
 
-def _packed(values: np.ndarray, valid: np.ndarray, steps: int) -> tuple[PackedField, tuple[np.ndarray, np.ndarray]]:
-    """The values as they are kept, and as they come back."""
-    known = values[valid].astype(np.float32)
-    low, high = (float(np.log(known.min())), float(np.log(known.max()))) if len(known) else (0.0, 0.0)
-    log = np.log(np.where(valid, values, np.float32(np.exp(low)))).clip(low, high)
-    codes = np.rint((log - low) * (steps / max(high - low, 1e-9))).astype(np.uint16) + np.uint16(1)
-    codes[~valid] = 0
-    field = PackedField(codes.shape, low, high, steps, _written(codes).tobytes())
-    return field, _decoded(codes, low, high, steps)
+class Packing:
+    """A keyframe being packed: what can wait is done on a second core, where there is one, while others go on.
+
+    The image begins at once, then comes `round`, then `done`.
+    """
+
+    def __init__(self, image: np.ndarray):
+        self._jpeg = later(_jpeg, image)
+
+    def round(self, prediction: DepthPrediction) -> DepthPrediction:
+        """The prediction as it will come back."""
+        valid = prediction.valid & (prediction.distance > 0) & np.isfinite(prediction.distance)
+        distance = _Codes.of(prediction.distance, valid, _STEPS)
+        self._prediction, self._distance, self._uncertainty = prediction, later(distance.packed), None
+        sigma = prediction.uncertainty
+        if sigma is not None:
+            uncertainty = _Codes.of(sigma, valid & (sigma > 0), _FEW_STEPS)
+            self._uncertainty, sigma = later(uncertainty.packed), uncertainty.values()[0]
+        rounded = distance.values()[0]
+        return replace(prediction, distance=rounded, valid=valid, uncertainty=sigma, albedo=None, normals=None)
+
+    def done(self) -> PackedView:
+        p = self._prediction
+        uncertainty = None if self._uncertainty is None else self._uncertainty.result()
+        return PackedView(p.name, p.camera, p.source, p.unit, self._distance.result(), uncertainty, self._jpeg.result())
 
 
-def _decoded(codes: np.ndarray, low: float, high: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    valid = codes > 0
-    step = (high - low) / steps
-    return np.where(valid, np.exp(np.float32(low) + np.float32(step) * (codes - np.float32(1))), 1), valid
+def _jpeg(image: np.ndarray) -> bytes:
+    pixels = cv2.cvtColor(cv2.convertScaleAbs(np.maximum(image, 0), alpha=255), cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+
+
+@dataclass(frozen=True)
+class _Codes:
+    """A field in steps of its logarithm, codes (h, w) uint16 from 1 up; 0 is invalid."""
+
+    codes: np.ndarray
+    low: float
+    high: float
+    steps: int
+
+    @classmethod
+    def of(cls, values: np.ndarray, valid: np.ndarray, steps: int) -> _Codes:
+        known = values[valid].astype(np.float32)
+        low, high = (float(np.log(known.min())), float(np.log(known.max()))) if len(known) else (0.0, 0.0)
+        log = np.log(np.where(valid, values, np.float32(np.exp(low)))).clip(low, high)
+        codes = np.rint((log - low) * (steps / max(high - low, 1e-9))).astype(np.uint16) + np.uint16(1)
+        codes[~valid] = 0
+        return cls(codes, low, high, steps)
+
+    def packed(self) -> PackedField:
+        return PackedField(self.codes.shape, self.low, self.high, self.steps, _written(self.codes).tobytes())
+
+    def values(self) -> tuple[np.ndarray, np.ndarray]:
+        """Values float32, 1 where invalid, and validity, both (h, w)."""
+        valid = self.codes > 0
+        step = (self.high - self.low) / self.steps
+        log = np.float32(self.low) + np.float32(step) * (self.codes - np.float32(1))
+        return np.where(valid, np.exp(log), 1), valid
 
 
 @compiled

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from densify.compiled import compiled
+from densify.second_core import halves
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
@@ -58,7 +59,10 @@ class DirectionTable:
 
     def look_up(self, origins: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         """Pixels (n, m) int32 of the directions of points origins (n, 3) + offsets (3, m), float32."""
-        return _look_up(self.cells, np.float32(self.scale), origins, offsets)
+        pixels = np.empty((len(origins), offsets.shape[1]), np.int32)
+        scale = np.float32(self.scale)
+        halves(lambda first, end: _look_up(self.cells, scale, origins, offsets, first, end, pixels), len(origins))
+        return pixels
 
 
 @dataclass(frozen=True)
@@ -117,10 +121,17 @@ def surface_view(
     trust = light_weight(light, config)
     if sigma is not None:
         trust /= 1 + (sigma / np.float32(config.sigma)) ** 2
-    planes, weights, colors = _planes(
-        points, distance, valid & (distance <= max_distance), valid, edge, trust.astype(np.float32, copy=False), color,
-        lens.rays, *lens.gaps, np.float32(config.max_slope),
+    near, trust = valid & (distance <= max_distance), trust.astype(np.float32, copy=False)
+    planes = np.zeros((valid.size + 1, 4), np.float32)
+    weights, colors = np.zeros(len(planes), np.uint8), np.zeros((len(planes), 4), np.uint8)
+    halves(
+        lambda first, end: _planes(
+            points, distance, near, valid, edge, trust, color, lens.rays, *lens.gaps, np.float32(config.max_slope),
+            first, end, planes, weights, colors,
+        ),
+        len(valid),
     )  # fmt: skip
+    colors[:, 3] = 1
     points = np.concatenate([points.reshape(3, -1), np.zeros((3, 1), np.float32)], 1)
     return SurfaceView(points, planes, weights, colors, lens.table)
 
@@ -132,19 +143,20 @@ def light_weight(value: np.ndarray, config: RectifyConfig) -> np.ndarray:
 
 
 @compiled
-def _planes(points, distance, near, valid, edge, trust, color, rays, gaps_u, gaps_v, max_slope):
-    """Planes (n + 1, 4), weights (n + 1,) and colours (n + 1, 4) of the pixels, and of none.
+def _planes(
+    points, distance, near, valid, edge, trust, color, rays, gaps_u, gaps_v, max_slope,
+    first, end, planes, weights, colors,
+):  # fmt: skip
+    """Fills in the planes (n, 4), weights (n,) and colours (n, 4), all of them 0, of the rows of pixels first to end.
 
     The normal is P_u x P_v, away from the camera, with differences of P to both sides, or to one where the other is
     across an edge or unknown: exact on a plane. A pixel with no neighbour along an axis faces the camera. Beside an
     edge, on either side, and where a pixel is not `near` (h, w) nothing is known.
     """
     height, width = valid.shape
-    planes = np.zeros((height * width + 1, 4), np.float32)
-    weights, colors = np.zeros(height * width + 1, np.uint8), np.zeros((height * width + 1, 4), np.uint8)
     zero, one, full = np.float32(0), np.float32(1), np.float32(FULL)
     steps = np.empty((2, 3), np.float32)
-    for row in range(height):
+    for row in range(first, end):
         for column in range(width):
             i = row * width + column
             for c in range(3):
@@ -184,8 +196,6 @@ def _planes(points, distance, near, valid, edge, trust, color, rays, gaps_u, gap
             weights[i] = np.uint8(np.rint(min(max(full * cosine * trust[row, column], one), full)))
             planes[i, 0], planes[i, 1], planes[i, 2] = x, y, z
             planes[i, 3] = x * points[0, row, column] + y * points[1, row, column] + z * points[2, row, column]
-    colors[:, 3] = 1
-    return planes, weights, colors
 
 
 def _halves(array: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
@@ -203,12 +213,11 @@ def _merge(values: np.ndarray, valid: np.ndarray, size: int) -> np.ndarray:
 
 
 @compiled
-def _look_up(cells, scale, origins, offsets):
+def _look_up(cells, scale, origins, offsets, first, end, pixels):
     # Choices instead of min and max, and the table in a loop of its own: so the first is done eight at a time.
     count, places, size = offsets.shape[1], cells.reshape(-1), np.int32(len(cells))
     half, last, zero = np.float32(size / 2), np.float32(size - 1), np.float32(0)
-    pixels = np.empty((len(origins), count), np.int32)
-    for i in range(len(origins)):
+    for i in range(first, end):
         a, b, c = origins[i, 0], origins[i, 1], origins[i, 2]
         out = pixels[i]
         for v in range(count):
@@ -226,7 +235,6 @@ def _look_up(cells, scale, origins, offsets):
             out[v] = np.int32(row) * size + np.int32(column)
         for v in range(count):
             out[v] = places[out[v]]
-    return pixels
 
 
 @lru_cache(maxsize=8)
