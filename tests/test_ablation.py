@@ -242,6 +242,18 @@ def test_a_difference_is_clear_where_its_mean_is_larger_than_its_spread_over_the
     assert not clear(np.array([0.5]))
 
 
+@pytest.mark.parametrize("base", [result("base", 3, 0.8), result("base", 9, 0.8, failed="it went nowhere")])
+def test_a_row_without_a_seed_in_common_with_the_first_is_shown_with_nothing_to_compare(base, tmp_path):
+    rows = (Row("base"), Row("other", part="reference", seeds=(9,)))
+    table = Table("base", rows, JUDGED, [base, result("other", 9, 0.9)], TubeData(scenes=2), (40, 32), 4)
+    write_table(table, tmp_path, None)
+    text = (tmp_path / "ablation.md").read_text()
+    assert "| other |  | .900 |  | no seed that the first row has |" in text
+    assert "other (" not in text and ("| base |  | .800 |  |  |" in text) == (not base.failed)
+    (found,) = (line for line in json.loads((tmp_path / "ablation.json").read_text()) if line["row"] == "other")
+    assert found["difference"] == [] and found["overall"] == [0.9]
+
+
 def test_the_overall_number_is_the_geometric_mean_over_colons_and_metrics(tmp_path):
     table = table_of(base=(0.8,))
     closed = {"a": dict.fromkeys(METRICS, 1.0), "b": dict.fromkeys(METRICS, 4.0)}

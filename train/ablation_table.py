@@ -90,10 +90,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of the table: `values` by seed, each (sets, metrics), and the same of the base."""
+    """A line of the table: `values` by seed, each (sets, metrics), and the same of the base, which may have other
+    seeds."""
 
     name: str
     row: Row
+    is_base: bool
     values: dict[int, np.ndarray]
     base: dict[int, np.ndarray]
 
@@ -110,8 +112,9 @@ class Line:
         return _overall(self.cells())
 
     def differences(self) -> np.ndarray:
-        """Of the cells to the base's, (seeds, sets, metrics)."""
-        return np.stack([self.values[seed] - self.base[seed] for seed in self.seeds])
+        """Of the cells to the base's, (seeds, sets, metrics), for the seeds that both have."""
+        shared = [self.values[seed] - self.base[seed] for seed in self.seeds]
+        return np.stack(shared) if shared else self.cells()[:0]
 
     def overall_differences(self) -> np.ndarray:
         """(seeds,)"""
@@ -121,10 +124,10 @@ class Line:
         return float(self.overall_differences().mean())
 
     def verdict(self) -> str:
-        """worse or better, the same "in every seed" where it is not clear, no clear difference, or one seed."""
+        """worse or better, the same "in every seed" where it is not clear, no clear difference, one seed, or none."""
         found = self.overall_differences()
         if len(found) < 2:
-            return "one seed"
+            return "one seed" if len(found) else "no seed that the first row has"
         side = "worse" if found.mean() > 0 else "better"
         if clear(found):
             return side
@@ -141,7 +144,7 @@ def _overall(ratios: np.ndarray) -> np.ndarray:
 
 
 def lines(table: Table) -> list[Line]:
-    """Of the rows that were trained; the base first."""
+    """Of the rows that were trained; the base first, if it was."""
     first = table.rows[0]
     base = {r.seed: r.ratios(first.told[0]) for r in table.results if r.row == first.name and not r.failed}
     found = []
@@ -149,7 +152,8 @@ def lines(table: Table) -> list[Line]:
         of = [r for r in table.results if r.row == row.name and not r.failed]
         for told in row.told if of else ():
             name = f"{row.name}; told {_TOLD[told]}" if len(row.told) > 1 else row.name
-            found.append(Line(name, row, {r.seed: r.ratios(told) for r in of}, base))
+            is_base = row is first and told == first.told[0]
+            found.append(Line(name, row, is_base, {r.seed: r.ratios(told) for r in of}, base))
     return found
 
 
@@ -253,14 +257,16 @@ def _spread(values: np.ndarray) -> str:
 
 
 def _difference(values: np.ndarray) -> str:
+    if not len(values):
+        return ""
     text = _number(float(values.mean()), signed=True)
     return f"**{text}**" if clear(values) else text
 
 
 def _overall_table(found: Sequence[Line]) -> str:
     text = ["## All together", "", "| row | what is different | overall | difference | |", "|---|---|---|---|---|"]
-    for i, line in enumerate(found):
-        difference, verdict = ("", "") if i == 0 else (_difference(line.overall_differences()), line.verdict())
+    for line in found:
+        difference, verdict = ("", "") if line.is_base else (_difference(line.overall_differences()), line.verdict())
         text.append(f"| {line.name} | {line.row.change} | {_spread(line.overall())} | {difference} | {verdict} |")
     return "\n".join([*text, ""])
 
@@ -269,7 +275,8 @@ def _says(found: Sequence[Line]) -> str:
     """Which ingredients earn their place and which do not, by the rule of the table."""
     text = ["## What it says", ""]
     for part, headings in _HEADINGS.items():
-        of = sorted((line for line in found[1:] if line.row.part == part), key=lambda line: -line.mean_difference())
+        of = [line for line in found if line.row.part == part and line.seeds and not line.is_base]
+        of.sort(key=lambda line: -line.mean_difference())
         for verdict, heading in headings.items():
             names = [
                 f"{line.name} ({_number(line.mean_difference(), signed=True)})"
@@ -291,11 +298,10 @@ def _closed_form(table: Table) -> str:
 def _set_table(colons: JudgedColons, index: int, found: Sequence[Line]) -> str:
     header = " | ".join(f"{name} | difference" for name in METRICS.values())
     text = [f"## Judged on {colons.name}", "", f"| row | {header} |", "|---|" + "---|---|" * len(METRICS)]
-    for i, line in enumerate(found):
-        values, differences = line.cells()[:, index], line.differences()[:, index]
-        cells = [
-            f"{_spread(values[:, k])} | {_difference(differences[:, k]) if i else ''}" for k in range(len(METRICS))
-        ]
+    for line in found:
+        values = line.cells()[:, index]
+        differences = (line.differences()[:0] if line.is_base else line.differences())[:, index]
+        cells = [f"{_spread(values[:, k])} | {_difference(differences[:, k])}" for k in range(len(METRICS))]
         text.append(f"| {line.name} | {' | '.join(cells)} |")
     return "\n".join([*text, ""])
 
