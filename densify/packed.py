@@ -69,17 +69,10 @@ class PackedView:
         return unit_range(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
 
 
-def packed_view(prediction: DepthPrediction, image: np.ndarray) -> tuple[PackedView, DepthPrediction]:
-    """What is kept of a keyframe, and its prediction as it will come back. image (H, W, 3) float32 in [0, 1]."""
-    packing = Packing(image)
-    rounded = packing.round(prediction)
-    return packing.done(), rounded
-
-
 class Packing:
     """A keyframe being packed: what can wait is done on a second core, where there is one, while others go on.
 
-    The image begins at once, then comes `round`, then `done`.
+    The image (H, W, 3), float32 in [0, 1], begins at once, then comes `round`, then `done`.
     """
 
     def __init__(self, image: np.ndarray):
@@ -98,6 +91,7 @@ class Packing:
         return replace(prediction, distance=rounded, valid=valid, uncertainty=sigma, albedo=None, normals=None)
 
     def done(self) -> PackedView:
+        """What is kept of the keyframe."""
         p = self._prediction
         uncertainty = None if self._uncertainty is None else self._uncertainty.result()
         return PackedView(p.name, p.camera, p.source, p.unit, self._distance.result(), uncertainty, self._jpeg.result())

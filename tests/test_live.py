@@ -15,7 +15,7 @@ from densify.contradiction import ContradictionConfig
 from densify.coverage import coverage
 from densify.fusion import FusionConfig
 from densify.live import Densifier
-from densify.packed import packed_view
+from densify.packed import PackedView, Packing
 from densify.pipeline import DensifyConfig, densify_submap
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
@@ -46,6 +46,13 @@ def fed(densifier: Densifier, frames, submap: Submap, keyframes=None) -> Densifi
     for keyframe in submap.keyframes if keyframes is None else keyframes:
         densifier.add_keyframe(by_number[keyframe.number], keyframe, points_of(submap, keyframe))
     return densifier
+
+
+def packed_view(prediction: DepthPrediction, image: np.ndarray) -> tuple[PackedView, DepthPrediction]:
+    """What is kept of a keyframe, and its prediction as it will come back."""
+    packing = Packing(image)
+    rounded = packing.round(prediction)
+    return packing.done(), rounded
 
 
 def as_kept(frame: Frame) -> tuple[Frame, DepthPrediction]:
