@@ -34,8 +34,8 @@ from densify.tables import write_evaluations
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.commands import write_synthetic
 from lightdepth.datasets import FrameSequence, open_sequence
-from lightdepth.datasets.folder import read_tum
 from lightdepth.errors import InputError
+from lightdepth.files.tum import read_tum
 from lightdepth.maps import read_map
 from lightdepth.progress import Progress
 from lightdepth.run import plain, run_folder

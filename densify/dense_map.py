@@ -13,10 +13,11 @@ import numpy as np
 
 from densify.alignment import Alignment
 from lightdepth import native
-from lightdepth.calibration import read_camera, read_json, write_camera
+from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.folder import read_tum, write_tum
 from lightdepth.errors import InputError
+from lightdepth.files.schema import read_json
+from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.sparse_map import Submap
 
 GREEN, RED, GREY = (0, 170, 60), (220, 30, 30), (150, 150, 150)

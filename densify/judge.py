@@ -38,10 +38,10 @@ from densify.trajectory import (
     trajectory_files,
     trajectory_summary,
 )
-from lightdepth.calibration import read_json
 from lightdepth.datasets import FrameSequence
 from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
+from lightdepth.files.schema import read_json
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
 from lightdepth.prediction import read_prediction

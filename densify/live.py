@@ -29,8 +29,8 @@ from densify.packed import PackedView, Packing
 from densify.pipeline import DensifyConfig, Model, split_withheld, typical_distance
 from densify.rectify import SurfaceView, surface_view
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.sequence import unit_range
 from lightdepth.errors import InputError
+from lightdepth.files.images import unit_range
 from lightdepth.frame import Frame
 from lightdepth.observations import observed_distances
 from lightdepth.photometry import PhotometricCalibration

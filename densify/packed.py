@@ -16,7 +16,7 @@ import numpy as np
 from densify.compiled import compiled
 from densify.second_core import later
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.sequence import decode, unit_range
+from lightdepth.files.images import decode, unit_range
 from lightdepth.prediction import DepthPrediction
 
 _JPEG_QUALITY = 95

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from densify.evaluation import Similarity, ate, fit_similarity, rms, sideways_agreement
-from lightdepth.datasets.folder import read_tum
 from lightdepth.errors import InputError
+from lightdepth.files.tum import read_tum
 from lightdepth.frame import frame_number
 from lightdepth.maps import read_trajectory
 from lightdepth.maps.convention import EXPORTER, declared_convention, frame_names

@@ -7,8 +7,9 @@ import json
 import pytest
 from scenes import C3VD, LENSES
 
-from lightdepth.calibration import read_camera, read_json, read_light, write_camera, write_light
+from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.errors import InputError
+from lightdepth.files.schema import read_json
 from lightdepth.photometry import PhotometricCalibration
 
 PINHOLE_FILE = {"model": "PINHOLE", "width": 640, "height": 480, "params": [500.0, 505.0, 319.5, 239.5]}

@@ -13,9 +13,10 @@ from scenes import cylinder
 
 from lightdepth.camera import Pinhole
 from lightdepth.datasets import FrameSequence, open_sequence, read_c3vd, read_folder, write_c3vd, write_folder
-from lightdepth.datasets.folder import read_tum, write_tum
-from lightdepth.datasets.sequence import border_mask, list_images, read_image, read_mask
+from lightdepth.datasets.sequence import border_mask, list_images, read_mask
 from lightdepth.errors import InputError
+from lightdepth.files.images import read_image
+from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.tube import lens, octagon

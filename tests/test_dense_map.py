@@ -16,8 +16,8 @@ from densify.dense_map import GREEN, GREY, RED, DenseMap, Surface, read_dense_ma
 from densify.pipeline import DensifyConfig, densify
 from lightdepth import native
 from lightdepth.calibration import read_camera
-from lightdepth.datasets.folder import read_tum
 from lightdepth.errors import InputError
+from lightdepth.files.tum import read_tum
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,9 @@ from colons import EXACT, colon, slam
 from lightdepth.camera import KannalaBrandt
 from lightdepth.datasets import open_sequence, write_endomapper
 from lightdepth.errors import InputError
+from lightdepth.files.rotations import quaternion_from_pose
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
-from lightdepth.maps.colmap import quaternion_from_pose
 from lightdepth.sparse_map import Submap
 from lightdepth.tube import lens
 

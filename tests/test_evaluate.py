@@ -21,8 +21,8 @@ from densify.pipeline import DensifyConfig, densify
 from densify.suite import alone
 from densify.tables import Table, depth_table, long_rows, surface_table, trajectory_table, write_evaluations
 from lightdepth.datasets import write_folder
-from lightdepth.datasets.folder import write_tum
 from lightdepth.errors import InputError
+from lightdepth.files.tum import write_tum
 from lightdepth.maps import write_multimap
 from lightdepth.metrics import ALIGNMENTS, NAMES
 

@@ -15,8 +15,8 @@ from lightdepth.calibration import write_light
 from lightdepth.camera import KannalaBrandt, Pinhole
 from lightdepth.datasets import open_sequence, write_folder
 from lightdepth.datasets.checks import AS_GIVEN, check_sequence, comb_ratio, fitting_reading
-from lightdepth.datasets.sequence import read_image
 from lightdepth.errors import InputError
+from lightdepth.files.images import read_image
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.tube import lens

@@ -19,8 +19,8 @@ from densify.trajectory import (
     trajectory_files,
     trajectory_summary,
 )
-from lightdepth.datasets.folder import write_tum
 from lightdepth.errors import InputError
+from lightdepth.files.tum import write_tum
 from lightdepth.maps import write_multimap
 
 

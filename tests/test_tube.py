@@ -10,8 +10,8 @@ import torch
 from colons import CAMERA, EXACT, SMALL, colon, slam
 
 from lightdepth.camera import KannalaBrandt, Pinhole, Scaramuzza
-from lightdepth.datasets.folder import to_bgr8
 from lightdepth.errors import InputError
+from lightdepth.files.images import to_bgr8
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.tube import Tube, camera_path, lens, octagon, render_sequence, tube_frames
 from lightdepth.tube.slam import SlamConfig, simulate_slam

@@ -15,9 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from densify.bench.scenes import SUITE_VERSION
 from densify.bench.work import INLIERS, SPARSE, BenchConfig
 from densify.tables import Table
-from lightdepth.calibration import read_json
-from lightdepth.calibration.json_files import checked_fields
 from lightdepth.errors import InputError
+from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.run import git_revision, plain, versions
 
 COLUMNS = {

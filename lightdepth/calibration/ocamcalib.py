@@ -18,9 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lightdepth.calibration.plain_text import cannot_hold, read_text, rows, to_numbers, write_text
+from lightdepth.calibration.plain_text import cannot_hold
 from lightdepth.camera import CameraModel, Scaramuzza, camera_from_params
 from lightdepth.errors import InputError
+from lightdepth.files.text import read_text, rows, to_numbers, write_text
 
 _INVERSE_ERROR_PX = 0.01  # the toolbox's own
 _LINES = "calib_results.txt with five lines: polynomial, inverse polynomial, centre, affine c d e, height and width"

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lightdepth.calibration.plain_text import cannot_hold, read_text, to_numbers, write_text
+from lightdepth.calibration.plain_text import cannot_hold
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, camera_from_params
 from lightdepth.errors import InputError
+from lightdepth.files.text import read_text, to_numbers, write_text
 
 _FISHEYE = ("fisheye", "equidistant")
 _BROWN = ("plumb_bob", "radtan", "opencv", "brown", "")

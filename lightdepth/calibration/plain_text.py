@@ -7,33 +7,14 @@ OpenCV's calibration: there it is at (0, 0).
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 
 from lightdepth.camera import CameraModel, Pinhole, Scaramuzza, camera_from_params
 from lightdepth.errors import InputError
-
-
-def read_text(path: Path, expected: str) -> str:
-    """The file's text; `expected` ends the message when it is something else."""
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {expected}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file; {expected}") from error
-    if "\0" in text:
-        raise InputError(f"{path}: not a text file; {expected}")
-    return text
-
-
-def write_text(path: Path, text: str) -> None:
-    """The file, whole or not at all."""
-    partial = Path(path).with_name(f".{Path(path).name}.partial")
-    partial.write_text(text)
-    os.replace(partial, path)
+from lightdepth.files.colmap_cameras import read_cameras_text
+from lightdepth.files.text import read_text, rows, to_numbers, write_text
 
 
 def cannot_hold(path: Path, program: str, what: str, *models: str) -> InputError:
@@ -44,29 +25,8 @@ def cannot_hold(path: Path, program: str, what: str, *models: str) -> InputError
     )
 
 
-def rows(text: str) -> list[list[str]]:
-    """The words of every line that is neither empty nor a comment."""
-    lines = (line.split() for line in text.lstrip("\ufeff").splitlines())
-    return [words for words in lines if words and not words[0].startswith(("#", "%"))]
-
-
-def to_numbers(words: list[str], where: str, expected: str) -> list[float]:
-    """Words as finite numbers; raises InputError with the first that is none."""
-    numbers = []
-    for word in words:
-        try:
-            numbers.append(float(word))
-        except ValueError:
-            raise InputError(f"{where}: found {word!r}, which is not a number; expected {expected}") from None
-        if not np.isfinite(numbers[-1]):
-            raise InputError(f"{where}: {word} is not finite; expected {expected}")
-    return numbers
-
-
 def read_colmap_camera(path: Path) -> CameraModel:
     """The camera of a cameras.txt that holds exactly one."""
-    from lightdepth.maps.colmap import read_cameras_text  # which needs this package itself, to read its sidecar
-
     cameras = read_cameras_text(path)
     if len(cameras) > 1:
         raise InputError(

@@ -16,17 +16,11 @@ from lightdepth.calibration.json_files import (
 )
 from lightdepth.calibration.ocamcalib import is_ocamcalib, read_ocamcalib, write_ocamcalib
 from lightdepth.calibration.opencv import read_opencv, write_opencv
-from lightdepth.calibration.plain_text import (
-    read_colmap_camera,
-    read_intrinsics,
-    read_text,
-    rows,
-    write_colmap_camera,
-    write_intrinsics,
-)
+from lightdepth.calibration.plain_text import read_colmap_camera, read_intrinsics, write_colmap_camera, write_intrinsics
 from lightdepth.calibration.vicalib import read_photometric, read_vicalib, write_photometric, write_vicalib
 from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.errors import InputError
+from lightdepth.files.text import read_text, rows
 from lightdepth.photometry import PhotometricCalibration
 
 CAMERA_FORMATS = (

@@ -19,9 +19,10 @@ import defusedxml.ElementTree
 import numpy as np
 from defusedxml import DefusedXmlException
 
-from lightdepth.calibration.plain_text import cannot_hold, read_text, to_numbers, write_text
+from lightdepth.calibration.plain_text import cannot_hold
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, camera_from_params
 from lightdepth.errors import InputError
+from lightdepth.files.text import read_text, to_numbers, write_text
 from lightdepth.photometry import PhotometricCalibration
 
 if TYPE_CHECKING:

@@ -23,7 +23,6 @@ import cv2
 import numpy as np
 
 from lightdepth.camera import CameraModel, Scaramuzza
-from lightdepth.datasets.folder import to_bgr8
 from lightdepth.datasets.sequence import (
     FrameSequence,
     along_ray,
@@ -31,10 +30,10 @@ from lightdepth.datasets.sequence import (
     found_mask,
     numbered_files,
     read_code,
-    read_image,
     warn_of_gaps,
 )
 from lightdepth.errors import InputError
+from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.sparse_map import check_rigid

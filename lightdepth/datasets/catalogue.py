@@ -19,10 +19,11 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from lightdepth.calibration import camera_from_fields, checked_fields
+from lightdepth.calibration import camera_from_fields
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.reading import FORMATS
 from lightdepth.errors import InputError
+from lightdepth.files.schema import checked_fields
 
 _Schema = TypeVar("_Schema", bound=BaseModel)
 

@@ -21,19 +21,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lightdepth.calibration import read_camera, read_json, read_light, write_camera, write_light
+from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import (
-    FrameSequence,
-    check_one_size,
-    found_mask,
-    list_images,
-    no_images,
-    read_image,
-    read_mask,
-)
+from lightdepth.datasets.sequence import FrameSequence, check_one_size, found_mask, list_images, no_images, read_mask
 from lightdepth.errors import InputError
+from lightdepth.files.images import read_image, to_bgr8
+from lightdepth.files.schema import read_json
 from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
 

@@ -27,9 +27,9 @@ from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole, camera_from_params
-from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import FrameSequence, found_mask, list_images, numbered_files, read_image
+from lightdepth.datasets.sequence import FrameSequence, found_mask, list_images, numbered_files
 from lightdepth.errors import InputError
+from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.frame import Frame, frame_number
 from lightdepth.photometry import PhotometricCalibration
 

@@ -13,23 +13,21 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.sequence import (
     FrameSequence,
     check_one_size,
-    image_size,
     legible,
     list_images,
     no_images,
-    read_image,
     read_mask,
-    read_raw,
     warn_of_gaps,
 )
 from lightdepth.errors import InputError
+from lightdepth.files.images import image_size, read_image, read_raw, to_bgr8
+from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
 
@@ -131,40 +129,3 @@ def read_times(path: Path) -> dict[str, float]:
         if not np.isfinite(times[name]):
             raise InputError(f"{path}: line {row}: {line!r}; expected NAME,seconds")
     return times
-
-
-def to_bgr8(image: np.ndarray) -> np.ndarray:
-    """RGB float in [0, 1] -> BGR uint8 for cv2."""
-    return cv2.cvtColor(np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
-
-
-def write_tum(path: Path, times: Iterable[float], world_from_cam: Iterable[np.ndarray]) -> None:
-    """`t tx ty tz qx qy qz qw`, camera to world."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lines = []
-    for time, pose in zip(times, world_from_cam, strict=True):
-        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        lines.append(" ".join([f"{time:.6f}", *(f"{v:.9f}" for v in (*pose[:3, 3], *quaternion))]))
-    path.write_text("\n".join(lines) + "\n")
-
-
-def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) and poses world_from_cam (n, 4, 4) of a TUM trajectory."""
-    try:
-        rows = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a TUM trajectory ({error})") from error
-    if rows.shape[1] != 8:
-        raise InputError(f"{path}: {rows.shape[1]} columns; a TUM trajectory has 8: t tx ty tz qx qy qz qw")
-    if not np.isfinite(rows).all():
-        line = int((~np.isfinite(rows)).any(1).argmax()) + 1
-        raise InputError(f"{path}: line {line} has NaN or infinite numbers; expected a pose for each frame")
-    length = np.linalg.norm(rows[:, 4:], axis=1)
-    if (length < 1e-6).any():
-        raise InputError(
-            f"{path}: line {int((length < 1e-6).argmax()) + 1}: the quaternion qx qy qz qw is zero; expected length 1"
-        )
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
-    poses[:, :3, 3] = rows[:, 1:4]
-    return rows[:, 0], poses

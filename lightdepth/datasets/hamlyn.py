@@ -20,7 +20,6 @@ import numpy as np
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole
-from lightdepth.datasets.folder import to_bgr8
 from lightdepth.datasets.sequence import (
     FrameSequence,
     along_ray,
@@ -28,10 +27,10 @@ from lightdepth.datasets.sequence import (
     found_mask,
     numbered_files,
     read_code,
-    read_image,
     warn_of_gaps,
 )
 from lightdepth.errors import InputError
+from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 

@@ -14,10 +14,11 @@ from lightdepth.datasets.endoslam import is_endoslam, read_endoslam
 from lightdepth.datasets.folder import read_folder
 from lightdepth.datasets.hamlyn import is_hamlyn, read_hamlyn
 from lightdepth.datasets.scared import is_scared, read_scared
-from lightdepth.datasets.sequence import FrameSequence, image_size, legible, list_images, read_image, read_mask
+from lightdepth.datasets.sequence import FrameSequence, legible, list_images, read_mask
 from lightdepth.datasets.simcol import is_simcol, read_simcol
 from lightdepth.datasets.video import VideoFile, read_video, video_at
 from lightdepth.errors import InputError
+from lightdepth.files.images import image_size, read_image
 from lightdepth.frame import check_image_size
 
 FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "scared", "endoslam", "endomapper", "video")

@@ -40,9 +40,9 @@ from lightdepth.calibration.opencv import read_matrices
 from lightdepth.camera import Brown, CameraModel, Pinhole, camera_from_params
 from lightdepth.camera_conversion import without_k3
 from lightdepth.datasets.checks import AS_GIVEN, INVERSE, READINGS, fitting_reading
-from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import FrameSequence, along_ray, decode_raw, numbered_files, read_image, read_raw
+from lightdepth.datasets.sequence import FrameSequence, along_ray, numbered_files
 from lightdepth.errors import InputError
+from lightdepth.files.images import decode_raw, read_image, read_raw, to_bgr8
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.sparse_map import check_rigid

@@ -13,9 +13,9 @@ from typing import overload
 
 import cv2
 import numpy as np
-from PIL import Image
 
 from lightdepth.errors import InputError
+from lightdepth.files.images import image_size, read_image, read_raw
 from lightdepth.frame import Frame, frame_number
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -114,48 +114,6 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     return found
 
 
-def read_image(path: Path) -> np.ndarray:
-    """(H, W, 3) float32 RGB in [0, 1]. 8- and 16-bit files alike."""
-    data = decode(read_bytes(path, "image"), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR, str(path))
-    return unit_range(cv2.cvtColor(data, cv2.COLOR_BGR2RGB, dst=data))
-
-
-def unit_range(pixels: np.ndarray) -> np.ndarray:
-    """uint8 or uint16 as float32 in [0, 1]."""
-    return np.divide(pixels, np.float32(np.iinfo(pixels.dtype).max), dtype=np.float32)
-
-
-def read_bytes(path: Path, what: str = "file") -> bytes:
-    """The file's bytes, or InputError where it is not there or cannot be read."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such {what}")
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-
-
-def decode(data: bytes, flags: int, where: str) -> np.ndarray:
-    """cv2's image in a file's bytes. imdecode refuses a truncated JPEG, whose rest imread would paint grey."""
-    if not data:
-        raise InputError(f"{where}: not a readable image (the file is empty, 0 bytes)")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if image is None:
-        raise InputError(f"{where}: not a readable image (truncated, or not an image at all)")
-    return image
-
-
-def read_raw(path: Path) -> np.ndarray:
-    """The file's own numbers, channels in the file's order (cv2's reversal undone)."""
-    return decode_raw(read_bytes(path), str(path))
-
-
-def decode_raw(data: bytes, where: str) -> np.ndarray:
-    """`read_raw` of a file's bytes; `where` names them in errors."""
-    image = decode(data, cv2.IMREAD_UNCHANGED, where)
-    return image if image.ndim == 2 else image[..., ::-1]
-
-
 def read_code(path: Path, ray_z: np.ndarray, whose: str) -> np.ndarray:
     """(H, W) uint16 depth as the file codes it, of the size of the rays. `whose` names the data set in errors."""
     code = read_raw(path)
@@ -197,16 +155,6 @@ def read_mask(path: Path, image: Path | None = None) -> np.ndarray:
     if mask.all() and not (grey > 127).any():
         raise InputError(f"{path}: the mask is black everywhere; expected white where tissue shows")
     return mask
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height, from the file's header alone where it has a legible one."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except OSError:
-        height, width = read_image(path).shape[:2]
-        return width, height
 
 
 def legible(images: Sequence[Path]) -> Path | None:

@@ -26,8 +26,9 @@ import numpy as np
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import endomapper
-from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask, unit_range
+from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask
 from lightdepth.errors import InputError
+from lightdepth.files.images import unit_range
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 

@@ -19,9 +19,10 @@ import numpy as np
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.folder import write_times
-from lightdepth.datasets.sequence import border_mask, border_region, unit_range
+from lightdepth.datasets.sequence import border_mask, border_region
 from lightdepth.errors import InputError
 from lightdepth.figures import thumbnail
+from lightdepth.files.images import unit_range
 from lightdepth.importing import findings as finding
 from lightdepth.importing.findings import Finding
 from lightdepth.importing.measures import Measures, Meter, eight_bits, one_field

@@ -12,10 +12,10 @@ import numpy as np
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.datasets import FrameSequence, VideoFile, open_sequence
-from lightdepth.datasets.folder import to_bgr8
-from lightdepth.datasets.sequence import list_images, read_image, read_mask
+from lightdepth.datasets.sequence import list_images, read_mask
 from lightdepth.datasets.video import found_calibration, quick_sample, video_at
 from lightdepth.errors import InputError
+from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.photometry import PhotometricCalibration
 
 

@@ -10,36 +10,22 @@ Formats: COLMAP documentation, "Output format".
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.errors import InputError
+from lightdepth.files.colmap_cameras import BinaryFile, read_cameras_binary, read_cameras_text
+from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
+from lightdepth.files.text import is_comment, numbered_lines, parse_integer, parse_numbers, text_lines
 from lightdepth.maps.checks import checked
 from lightdepth.maps.convention import COLMAP, MapConvention
 from lightdepth.sparse_map import Keyframe, Submap
 
 PARTS = ("cameras", "images", "points3D")
 
-_BINARY_MODELS = {  # model number in cameras.bin -> name, number of parameters
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-}
 _NO_POINT = 2**63  # COLMAP's invalid id is 2^64 - 1; text says -1
 
 
@@ -125,63 +111,6 @@ def _suffix(folder: Path) -> str:
 # ---- text
 
 
-def text_lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").split("\n")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file; a binary model's files end in .bin") from error
-
-
-def is_comment(line: str) -> bool:
-    """Whether a line says nothing: empty, or a comment."""
-    return not line.strip() or line.lstrip().startswith("#")
-
-
-def _entries(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines that are neither empty nor a comment."""
-    return (
-        (n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and not line.lstrip().startswith("#")
-    )
-
-
-def parse_numbers(tokens: list[str], where: str, expected: str) -> np.ndarray:
-    """Tokens as float64; raises InputError with the first that is not a number."""
-    try:
-        return np.array(tokens, dtype=np.float64)
-    except ValueError:
-        for token in tokens:
-            try:
-                float(token)
-            except ValueError:
-                raise InputError(f"{where}: found {token!r}, which is not a number; expected {expected}") from None
-        raise
-
-
-def _integer(token: str, where: str, expected: str) -> int:
-    try:
-        return int(token)
-    except ValueError:
-        raise InputError(f"{where}: found {token!r}, which is not an integer; expected {expected}") from None
-
-
-def read_cameras_text(path: Path) -> dict[int, CameraModel]:
-    """Cameras by id, in the file's own pixel convention."""
-    expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
-    cameras = {}
-    for number, line in _entries(path):
-        where, tokens = f"{path}, line {number}", line.split()
-        if len(tokens) < 5:
-            raise InputError(f"{where}: found {line.strip()[:60]!r}; expected {expected}")
-        camera_id, width, height = (_integer(tokens[k], where, expected) for k in (0, 2, 3))
-        params = parse_numbers(tokens[4:], where, expected).tolist()
-        cameras[camera_id] = camera_from_params(tokens[1], width, height, params, where)
-    if not cameras:
-        raise InputError(f"{path}: no camera in it; expected a line {expected}")
-    return cameras
-
-
 def _read_images_text(path: Path) -> list[ModelImage]:
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     images = []
@@ -192,8 +121,8 @@ def _read_images_text(path: Path) -> list[ModelImage]:
         where, tokens = f"{path}, line {number}", line.split(None, 9)
         if len(tokens) < 10:
             raise InputError(f"{where}: found {line.strip()[:60]!r}; expected {expected}, then a line of keypoints")
-        _integer(tokens[0], where, expected)
-        camera_id, name = _integer(tokens[8], where, expected), tokens[9].strip()
+        parse_integer(tokens[0], where, expected)
+        camera_id, name = parse_integer(tokens[8], where, expected), tokens[9].strip()
         numbers = parse_numbers(tokens[1:8], where, expected)
         pose = pose_from_quaternion(numbers[:4], numbers[4:], f"{where}: image {name}")
         number, line = next(lines, (number + 1, ""))  # the second line may be empty, but belongs to the image
@@ -214,7 +143,7 @@ def _read_images_text(path: Path) -> list[ModelImage]:
 def read_points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Point ids (n,) and points (n, 3). Colour, error and track may be missing, and are not used."""
     expected = "POINT3D_ID X Y Z [R G B ERROR TRACK...]"
-    entries = [(number, line.split(None, 4)[:4]) for number, line in _entries(path)]
+    entries = [(number, line.split(None, 4)[:4]) for number, line in numbered_lines(path)]
     try:
         ids = np.array([tokens[0] for _, tokens in entries], dtype=np.int64)
         points = np.array([tokens[1:] for _, tokens in entries], dtype=np.float64).reshape(-1, 3)
@@ -223,7 +152,7 @@ def read_points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
             where = f"{path}, line {number}"
             if len(tokens) < 4:
                 raise InputError(f"{where}: found {' '.join(tokens)!r}; expected {expected}") from None
-            _integer(tokens[0], where, expected)
+            parse_integer(tokens[0], where, expected)
             parse_numbers(tokens[1:], where, expected)
         raise
     bad = np.flatnonzero(~np.isfinite(points).all(1))
@@ -235,90 +164,12 @@ def read_points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return ids, points
 
 
-def pose_from_quaternion(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
-    """(4, 4) from a quaternion (w, x, y, z) and a translation (3,)."""
-    if not (np.isfinite(quaternion).all() and np.isfinite(translation).all()):
-        raise InputError(f"{where}: the pose has NaN or infinite numbers; leave out what was not localised")
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > 1e-2:
-        raise InputError(f"{where}: quaternion of norm {norm:.4g}; expected 1 (order w x y z)")
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    pose[:3, 3] = translation
-    return pose
-
-
-def quaternion_from_pose(pose: np.ndarray) -> np.ndarray:
-    """Unit quaternion (w, x, y, z), w >= 0, of a pose's rotation."""
-    return Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True, scalar_first=True)
-
-
 # ---- binary
-
-
-class _Bytes:
-    """A file's bytes, taken in order; little-endian."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.at = path, 0
-        try:
-            self.data = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-
-    def take(self, layout: str) -> tuple:
-        size = struct.calcsize("<" + layout)
-        return struct.unpack("<" + layout, self._next(size))
-
-    def array(self, dtype: np.dtype, count: int) -> np.ndarray:
-        return np.frombuffer(self._next(dtype.itemsize * count), dtype)
-
-    def text(self) -> str:
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise self._short()
-        name = self._next(end + 1 - self.at)[:-1]
-        try:
-            return name.decode()
-        except UnicodeDecodeError as error:
-            raise InputError(
-                f"{self.path}: an image name is not text at byte {self.at}; not a COLMAP binary file?"
-            ) from error
-
-    def end(self) -> None:
-        if self.at != len(self.data):
-            raise InputError(
-                f"{self.path}: {len(self.data) - self.at} bytes too many; not a COLMAP binary file of this kind"
-            )
-
-    def _next(self, size: int) -> bytes:
-        if self.at + size > len(self.data):
-            raise self._short()
-        self.at += size
-        return self.data[self.at - size : self.at]
-
-    def _short(self) -> InputError:
-        return InputError(
-            f"{self.path}: ends too early, at byte {len(self.data)}; copied incompletely, or not COLMAP's?"
-        )
-
-
-def read_cameras_binary(path: Path) -> dict[int, CameraModel]:
-    data, cameras = _Bytes(path), {}
-    for _ in range(data.take("Q")[0]):
-        camera_id, model, width, height = data.take("IiQQ")
-        if model not in _BINARY_MODELS:
-            known = ", ".join(name for name, _ in _BINARY_MODELS.values())
-            raise InputError(f"{path}: camera {camera_id} has the unknown model number {model}; known are {known}")
-        name, count = _BINARY_MODELS[model]
-        cameras[camera_id] = camera_from_params(name, width, height, list(data.take(f"{count}d")), str(path))
-    data.end()
-    return cameras
 
 
 def _read_images_binary(path: Path) -> list[ModelImage]:
     keypoint = np.dtype([("xy", "<f8", 2), ("id", "<u8")])
-    data, images = _Bytes(path), []
+    data, images = BinaryFile(path), []
     for _ in range(data.take("Q")[0]):
         numbers = data.take("I7dI")
         name = data.text()
@@ -333,7 +184,7 @@ def _read_images_binary(path: Path) -> list[ModelImage]:
 
 
 def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    data, ids, points = _Bytes(path), [], []
+    data, ids, points = BinaryFile(path), [], []
     for _ in range(data.take("Q")[0]):
         point_id, *xyz = data.take("Q3d")
         data.take("3Bd")

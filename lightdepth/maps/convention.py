@@ -14,9 +14,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from lightdepth.calibration import checked_fields, read_json
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
+from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.frame import frame_number
 from lightdepth.sparse_map import Keyframe
 

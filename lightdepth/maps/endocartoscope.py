@@ -19,18 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from lightdepth.errors import InputError
+from lightdepth.files.colmap_cameras import read_cameras_text
+from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
+from lightdepth.files.text import is_comment, parse_numbers, text_lines
 from lightdepth.frame import frame_number
-from lightdepth.maps.colmap import (
-    assembled,
-    is_comment,
-    parse_numbers,
-    pose_from_quaternion,
-    quaternion_from_pose,
-    read_cameras_text,
-    read_points_text,
-    read_submap,
-    text_lines,
-)
+from lightdepth.maps.colmap import assembled, read_points_text, read_submap
 from lightdepth.maps.convention import MapConvention
 from lightdepth.sparse_map import SparseMap, Submap
 

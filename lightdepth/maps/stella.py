@@ -19,10 +19,12 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from lightdepth.calibration import read_camera, read_json
+from lightdepth.calibration import read_camera
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
-from lightdepth.maps.colmap import assembled, pose_from_quaternion, quaternion_from_pose
+from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
+from lightdepth.files.schema import read_json
+from lightdepth.maps.colmap import assembled
 from lightdepth.maps.convention import EXPORTER, MapConvention, declared_convention, frame_names
 from lightdepth.sparse_map import Keyframe, Submap
 

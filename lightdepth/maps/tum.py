@@ -18,10 +18,12 @@ import numpy as np
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.folder import read_tum
 from lightdepth.errors import InputError
+from lightdepth.files.colmap_cameras import read_cameras_text
+from lightdepth.files.text import is_comment, parse_numbers, text_lines
+from lightdepth.files.tum import read_tum
 from lightdepth.maps.checks import seen_by_projection
-from lightdepth.maps.colmap import assembled, is_comment, parse_numbers, read_cameras_text, read_points_text, text_lines
+from lightdepth.maps.colmap import assembled, read_points_text
 from lightdepth.maps.convention import EXPORTER, MapConvention, declared_convention, frame_names
 from lightdepth.sparse_map import Submap
 

@@ -1,0 +1,91 @@
+"""Text files: whole, as lines, as numbers; what cannot be read is named with its place."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lightdepth.errors import InputError
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The file's text; `expected` ends the message when it is something else."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {expected}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file; {expected}") from error
+    if "\0" in text:
+        raise InputError(f"{path}: not a text file; {expected}")
+    return text
+
+
+def write_text(path: Path, text: str) -> None:
+    """The file, whole or not at all."""
+    partial = Path(path).with_name(f".{Path(path).name}.partial")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+def rows(text: str) -> list[list[str]]:
+    """The words of every line that is neither empty nor a comment."""
+    lines = (line.split() for line in text.lstrip("\ufeff").splitlines())
+    return [words for words in lines if words and not words[0].startswith(("#", "%"))]
+
+
+def to_numbers(words: list[str], where: str, expected: str) -> list[float]:
+    """Words as finite numbers; raises InputError with the first that is none."""
+    numbers = []
+    for word in words:
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            raise InputError(f"{where}: found {word!r}, which is not a number; expected {expected}") from None
+        if not np.isfinite(numbers[-1]):
+            raise InputError(f"{where}: {word} is not finite; expected {expected}")
+    return numbers
+
+
+def text_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").split("\n")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file; a binary model's files end in .bin") from error
+
+
+def is_comment(line: str) -> bool:
+    """Whether a line says nothing: empty, or a comment."""
+    return not line.strip() or line.lstrip().startswith("#")
+
+
+def numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Numbered lines that are neither empty nor a comment."""
+    return (
+        (n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and not line.lstrip().startswith("#")
+    )
+
+
+def parse_numbers(tokens: list[str], where: str, expected: str) -> np.ndarray:
+    """Tokens as float64; raises InputError with the first that is not a number."""
+    try:
+        return np.array(tokens, dtype=np.float64)
+    except ValueError:
+        for token in tokens:
+            try:
+                float(token)
+            except ValueError:
+                raise InputError(f"{where}: found {token!r}, which is not a number; expected {expected}") from None
+        raise
+
+
+def parse_integer(token: str, where: str, expected: str) -> int:
+    try:
+        return int(token)
+    except ValueError:
+        raise InputError(f"{where}: found {token!r}, which is not an integer; expected {expected}") from None

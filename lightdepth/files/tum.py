@@ -1,0 +1,43 @@
+"""TUM trajectories: time, position and quaternion of the camera in the world, a line each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lightdepth.errors import InputError
+
+
+def write_tum(path: Path, times: Iterable[float], world_from_cam: Iterable[np.ndarray]) -> None:
+    """`t tx ty tz qx qy qz qw`, camera to world."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = []
+    for time, pose in zip(times, world_from_cam, strict=True):
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        lines.append(" ".join([f"{time:.6f}", *(f"{v:.9f}" for v in (*pose[:3, 3], *quaternion))]))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and poses world_from_cam (n, 4, 4) of a TUM trajectory."""
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a TUM trajectory ({error})") from error
+    if rows.shape[1] != 8:
+        raise InputError(f"{path}: {rows.shape[1]} columns; a TUM trajectory has 8: t tx ty tz qx qy qz qw")
+    if not np.isfinite(rows).all():
+        line = int((~np.isfinite(rows)).any(1).argmax()) + 1
+        raise InputError(f"{path}: line {line} has NaN or infinite numbers; expected a pose for each frame")
+    length = np.linalg.norm(rows[:, 4:], axis=1)
+    if (length < 1e-6).any():
+        raise InputError(
+            f"{path}: line {int((length < 1e-6).argmax()) + 1}: the quaternion qx qy qz qw is zero; expected length 1"
+        )
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    return rows[:, 0], poses
