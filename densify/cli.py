@@ -29,7 +29,6 @@ from densify.page import densify_page, joined_section
 from densify.pipeline import DensifyConfig
 from densify.play import play, time_spent, timings_picture, write_timings
 from densify.rectify import RectifyConfig
-from densify.sfm import SfmConfig
 from densify.tables import write_evaluations
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.commands import write_synthetic
@@ -37,8 +36,9 @@ from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
 from lightdepth.maps import read_map
-from lightdepth.progress import Progress
-from lightdepth.run import plain, run_folder
+from lightdepth.reporting.progress import Progress
+from lightdepth.reporting.run import plain, run_folder
+from lightdepth.sfm.reconstruction import SfmConfig
 from lightdepth.tube import lens as tube_lens
 from lightdepth.tube import render_sequence
 from lightdepth.tube.slam import SlamConfig, simulate_slam

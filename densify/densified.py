@@ -11,9 +11,9 @@ from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, densify
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
-from lightdepth.predict import DepthModel
-from lightdepth.progress import Progress
-from lightdepth.run import Run, plain
+from lightdepth.models import DepthModel
+from lightdepth.reporting.progress import Progress
+from lightdepth.reporting.run import Run, plain
 from lightdepth.sparse_map import SparseMap
 
 

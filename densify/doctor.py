@@ -14,7 +14,7 @@ from lightdepth import native
 from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
-from lightdepth.run import versions
+from lightdepth.reporting.run import versions
 
 
 @dataclass(frozen=True)

@@ -27,15 +27,15 @@ from densify.judge import (
     withheld_errors,
 )
 from densify.pipeline import DensifyConfig
-from densify.sfm import SfmConfig
 from densify.suite import Suite, present, read_suite
 from densify.tables import write_evaluations
 from densify.trajectory import read_trajectories, trajectory_files
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
-from lightdepth.predict import DepthModel
-from lightdepth.run import plain, run_folder
+from lightdepth.models import DepthModel
+from lightdepth.reporting.run import plain, run_folder
+from lightdepth.sfm.reconstruction import SfmConfig
 from lightdepth.sparse_map import SparseMap
 
 

@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from densify.pipeline import fitted_to_frames
-from densify.sfm import SfmConfig, sparse_map_from_frames
-from densify.unmapped import summary
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
-from lightdepth.light_fit import fit_on_map, with_light
+from lightdepth.light.fit_on_map import fit_on_map, with_light
 from lightdepth.maps import read_map
 from lightdepth.maps.checks import check_shared_frames
+from lightdepth.models import DepthModel
 from lightdepth.photometry import PhotometricCalibration
-from lightdepth.predict import DepthModel
-from lightdepth.report import number
-from lightdepth.run import Run, plain
+from lightdepth.reporting.report import number
+from lightdepth.reporting.run import Run, plain
+from lightdepth.sfm.reconstruction import SfmConfig, sparse_map_from_frames
+from lightdepth.sfm.unmapped import summary
 from lightdepth.sparse_map import SparseMap
 
 

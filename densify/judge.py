@@ -45,7 +45,7 @@ from lightdepth.files.schema import read_json
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
 from lightdepth.prediction import read_prediction
-from lightdepth.run import git_revision, plain, versions
+from lightdepth.reporting.run import git_revision, plain, versions
 from lightdepth.sparse_map import SparseMap, check_rigid
 
 EDGES_MM = np.geomspace(0.05, 200, 145)

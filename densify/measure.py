@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import dijkstra
 from densify.coverage import patches, triangle_areas
 from densify.dense_map import DenseMapFiles, Surface, run_record
 from lightdepth.errors import InputError
-from lightdepth.report import number
+from lightdepth.reporting.report import number
 
 
 @dataclass(frozen=True, eq=False)

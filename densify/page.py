@@ -11,7 +11,7 @@ from densify.coverage import seen_well
 from densify.dense_map import DenseMap
 from densify.joining import Merged, joined_name
 from densify.pipeline import KeyframeView, SubmapResult
-from lightdepth.figures import (
+from lightdepth.reporting.figures import (
     BAD,
     GOOD,
     chart,
@@ -23,7 +23,7 @@ from lightdepth.figures import (
     side_by_side,
     thumbnail,
 )
-from lightdepth.report import Report, number
+from lightdepth.reporting.report import Report, number
 from lightdepth.sparse_map import SparseMap
 
 SEEN_WELL, SEEN_WEAKLY = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15)

@@ -20,7 +20,7 @@ from densify.live import STEPS, Densifier, StepTime
 from densify.pipeline import DensifyConfig, Model, frame_of
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
-from lightdepth.figures import chart, chart_png
+from lightdepth.reporting.figures import chart, chart_png
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 ALL_STEPS = ("read", *STEPS)

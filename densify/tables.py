@@ -19,8 +19,8 @@ import numpy as np
 
 from densify.judge import EDGES_MM, ErrorMesh, Evaluation, with_versions
 from densify.suite import Suite, alone
-from lightdepth.figures import chart, chart_png, mesh_picture, png, side_by_side
-from lightdepth.report import number
+from lightdepth.reporting.figures import chart, chart_png, mesh_picture, png, side_by_side
+from lightdepth.reporting.report import number
 
 MODELS = {"sparse": "Sparse map", "sparse_inliers": "Sparse inliers", "dense": "Dense"}
 _METRICS = {

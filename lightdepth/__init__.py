@@ -9,7 +9,7 @@ _HOMES = {
     "open_sequence": "lightdepth.datasets",
     "read_map": "lightdepth.maps",
     "load_model": "lightdepth.checkpoint",
-    "predict": "lightdepth.predict",
+    "predict": "lightdepth.models",
     "Frame": "lightdepth.frame",
     "DepthPrediction": "lightdepth.prediction",
     "SparseMap": "lightdepth.sparse_map",

@@ -16,8 +16,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 from lightdepth.errors import InputError
+from lightdepth.models import ConstantModel, DeclineModel, DepthModel, NetworkModel
 from lightdepth.network import DepthNetwork, NetworkConfig, build_network
-from lightdepth.predict import ConstantModel, DeclineModel, DepthModel, NetworkModel
 
 DEFAULT_CHECKPOINT = "lightdepth-synthetic"
 TRAINING_FREE: dict[str, type[DeclineModel] | type[ConstantModel]] = {

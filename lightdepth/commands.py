@@ -17,15 +17,15 @@ from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import open_sequence, write_c3vd, write_endomapper, write_folder
 from lightdepth.datasets.sequence import read_mask
 from lightdepth.errors import InputError
-from lightdepth.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.frame import Frame
-from lightdepth.light_fit import fit_on_map
-from lightdepth.light_page import light_page
-from lightdepth.light_truth import fit_on_truth
+from lightdepth.light.fit_on_map import fit_on_map
+from lightdepth.light.fit_on_truth import fit_on_truth
+from lightdepth.light.report import light_page
 from lightdepth.maps import read_map, write_multimap
-from lightdepth.progress import Progress
 from lightdepth.refine import RefineConfig, RefinedModel
-from lightdepth.run import plain, run_folder
+from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
+from lightdepth.reporting.progress import Progress
+from lightdepth.reporting.run import plain, run_folder
 from lightdepth.tube import lens as tube_lens
 from lightdepth.tube import render_sequence
 from lightdepth.tube.scene import TubeConfig, realistic

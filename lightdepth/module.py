@@ -148,7 +148,7 @@ class LightDepth(pl.LightningModule):
 
     def _start_from(self, checkpoint: str) -> None:
         from lightdepth.checkpoint import load_model
-        from lightdepth.predict import NetworkModel
+        from lightdepth.models import NetworkModel
 
         model = load_model(checkpoint, details=False)
         if not isinstance(model, NetworkModel):

@@ -23,7 +23,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import Frame, FrameBatch, to_batch
 from lightdepth.losses import LossConfig, Seen, indirect_light, self_supervised_loss
 from lightdepth.losses.masked import masked_mean
-from lightdepth.predict import DepthModel, extended, prediction_of, upsampled, working_size
+from lightdepth.models import DepthModel, extended, prediction_of, upsampled, working_size
 from lightdepth.prediction import DepthPrediction
 
 _RENEWED = 10

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
-from lightdepth import figures
+from lightdepth.reporting import figures
 
 LEVELS = (0.5, 0.68, 0.9, 0.95)
 """Shares of pixels that intervals are stated for."""

@@ -13,9 +13,9 @@ from lightdepth.errors import InputError, PartialFailure
 from lightdepth.frame import to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.maps import write_multimap
+from lightdepth.models import NetworkModel
 from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
-from lightdepth.predict import NetworkModel
 from train.adapt import Judgement, Verdict, adapt, verdict
 from train.adaptation import Adaptation, anchor_loss, let_learn, merge, source_colons, target_loss
 from train.datamodule import FrameDataModule, TubeData, collate

@@ -11,9 +11,9 @@ from scenes import cylinder
 from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, bundled, load_model, read_card, save_model
 from lightdepth.errors import InputError
+from lightdepth.models import ConstantModel, DeclineModel, NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import NetworkConfig, build_network
-from lightdepth.predict import ConstantModel, DeclineModel, NetworkModel
 
 SMALL = NetworkConfig(width=4, inputs=("rgb", "closed_form"))
 CARD = {"rows": 24, "trained_on": "nothing"}

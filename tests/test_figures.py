@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lightdepth.figures import (
+from lightdepth.reporting.figures import (
     BAD,
     GOOD,
     chart,

@@ -16,11 +16,11 @@ from lightdepth.datasets import FrameSequence, VideoFile, open_sequence, write_f
 from lightdepth.datasets.sequence import border_mask
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
+from lightdepth.image_quality import Measures, Meter, one_field
 from lightdepth.importing.command import import_frames
-from lightdepth.importing.measures import Measures, Meter, one_field
 from lightdepth.importing.overlay import find_overlay
 from lightdepth.importing.selection import BLURRED, FROZEN, KEPT, PASSED, UNREADABLE, Choice, selected
-from lightdepth.predict import DeclineModel, predict
+from lightdepth.models import DeclineModel, predict
 
 COUNT = 72
 TIMES = uneven_times(COUNT, seed=1)

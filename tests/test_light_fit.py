@@ -16,18 +16,11 @@ from lightdepth.cli import main
 from lightdepth.datasets import FrameSequence, open_sequence, write_folder
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
-from lightdepth.light_fit import (
-    LightSamples,
-    fit_on_map,
-    fit_samples,
-    map_views,
-    samples_of,
-    withheld_error,
-)
-from lightdepth.light_truth import fit_on_truth
+from lightdepth.light.fit_on_map import LightSamples, fit_on_map, fit_samples, map_views, samples_of, withheld_error
+from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.maps import read_map, write_multimap
+from lightdepth.models import ConstantModel, DeclineModel
 from lightdepth.photometry import PhotometricCalibration
-from lightdepth.predict import ConstantModel, DeclineModel
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 CAMERA = C3VD.resized(120, 96)

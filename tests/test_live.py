@@ -19,7 +19,7 @@ from densify.packed import PackedView, Packing
 from densify.pipeline import DensifyConfig, densify_submap
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
-from lightdepth.predict import DeclineModel
+from lightdepth.models import DeclineModel
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Keyframe, Submap
 

@@ -21,7 +21,7 @@ from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
-from lightdepth.predict import DeclineModel
+from lightdepth.models import DeclineModel
 from lightdepth.sparse_map import Keyframe, Submap
 from lightdepth.tube.slam import SlamConfig, simulate_slam
 

@@ -30,8 +30,8 @@ from densify.pipeline import (
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
+from lightdepth.models import ConstantModel, DeclineModel
 from lightdepth.observations import observed_distances
-from lightdepth.predict import ConstantModel, DeclineModel
 from lightdepth.sparse_map import Keyframe, SparseMap
 from lightdepth.tube import lens
 

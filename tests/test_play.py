@@ -21,7 +21,7 @@ from lightdepth.commands import write_synthetic
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.frame import Frame
-from lightdepth.predict import DeclineModel
+from lightdepth.models import DeclineModel
 
 DECLINE = DeclineModel(details=False)
 COARSE = DensifyConfig(withhold=0.0, fusion=FusionConfig(voxels_per_distance=15.0))

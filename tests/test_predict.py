@@ -5,9 +5,9 @@ from scenes import cylinder, slanted_plane, sphere
 
 from lightdepth.camera import KannalaBrandt, Pinhole
 from lightdepth.frame import Frame
+from lightdepth.models import ConstantModel, DeclineModel, NetworkModel, predict, working_size
 from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
-from lightdepth.predict import ConstantModel, DeclineModel, NetworkModel, predict, working_size
 
 PINHOLE = Pinhole(160, 120, 90.0, 90.0, 80.0, 60.0)
 FISHEYE = KannalaBrandt(150, 120, 70.0, 70.0, 75.0, 60.0, -0.13, -0.005, 0.0015, -0.0001)

@@ -22,7 +22,7 @@ from densify.pipeline import DensifyConfig, SubmapResult, densify, fitted_to_fra
 from lightdepth.datasets import FrameSequence, open_sequence, read_c3vd
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
-from lightdepth.predict import ConstantModel, DeclineModel
+from lightdepth.models import ConstantModel, DeclineModel
 from lightdepth.sparse_map import SparseMap
 from train.covisibility import SIFT_NODES, MapRules, select_by_map, select_by_matching
 from train.matching import OrientationDescriptor, SiftMatcher

@@ -10,8 +10,8 @@ from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
 from lightdepth.frame import to_batch
 from lightdepth.losses import LossConfig
+from lightdepth.models import ConstantModel, DeclineModel
 from lightdepth.photometry import PhotometricCalibration
-from lightdepth.predict import ConstantModel, DeclineModel
 from lightdepth.refine import RefineConfig, RefinedModel, refine
 
 CAMERA = Pinhole(80, 64, 60.0, 60.0, 40.0, 32.0)

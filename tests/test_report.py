@@ -14,9 +14,9 @@ from colons import colon, sequence, slam, truth
 
 from densify.page import Gallery, densify_page
 from densify.pipeline import DensifyConfig, densify
-from lightdepth.figures import png
-from lightdepth.predict import ConstantModel
-from lightdepth.report import Report, number
+from lightdepth.models import ConstantModel
+from lightdepth.reporting.figures import png
+from lightdepth.reporting.report import Report, number
 
 PIXEL = png(np.zeros((1, 1, 3), np.uint8))
 

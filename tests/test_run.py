@@ -13,8 +13,8 @@ import pytest
 import yaml
 
 from lightdepth.errors import InputError, PartialFailure
-from lightdepth.progress import Progress
-from lightdepth.run import git_revision, input_hash, plain, run_folder, versions, write_run_json
+from lightdepth.reporting.progress import Progress
+from lightdepth.reporting.run import git_revision, input_hash, plain, run_folder, versions, write_run_json
 
 
 def make(output: Path, text: str = "new", **given) -> None:

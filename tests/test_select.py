@@ -327,7 +327,9 @@ def test_the_verb_writes_list_table_page_and_pictures_and_nothing_over_what_is_t
 def test_nothing_is_written_when_no_frame_is_kept_or_writing_fails(data, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="none of the 18 frames is kept"):
         select(data, tmp_path / "a" / "list.txt", sift_nodes=replace(SIFT_NODES, min_matches=10**6))
-    monkeypatch.setattr("lightdepth.report.Report.write", lambda *_: (_ for _ in ()).throw(OSError(28, "disk full")))
+    monkeypatch.setattr(
+        "lightdepth.reporting.report.Report.write", lambda *_: (_ for _ in ()).throw(OSError(28, "disk full"))
+    )
     with pytest.raises(InputError, match="disk full"):
         select(data, tmp_path / "b" / "list.txt")
     assert not (tmp_path / "a").exists() and not list((tmp_path / "b").iterdir())

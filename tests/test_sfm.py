@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.sfm import SfmConfig, evened, fisheye_fit, sparse_map_from_frames, usable_pixels
 from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
+from lightdepth.sfm.reconstruction import SfmConfig, evened, fisheye_fit, sparse_map_from_frames, usable_pixels
 
 HALF = np.array([22.0, 18.0, 45.0])  # the box reaches from -HALF to HALF, in mm
 PINHOLE = Pinhole(240, 200, 150.0, 150.0, 119.0, 101.0)
@@ -189,7 +189,7 @@ def test_frames_of_two_cameras_or_with_one_number_are_refused(tmp_path):
 
 def test_a_png_can_be_written_after_pycolmap_was_loaded(tmp_path):
     program = (
-        "import densify.sfm, sys; assert 'pycolmap' not in sys.modules\n"
+        "import lightdepth.sfm.reconstruction, sys; assert 'pycolmap' not in sys.modules\n"
         "from lightdepth.native import pycolmap; pycolmap()\n"
         "import cv2, numpy\n"
         f"assert cv2.imwrite({str(tmp_path / 'a.png')!r}, numpy.zeros((64, 64, 3), numpy.uint8))\n"

@@ -23,10 +23,10 @@ from lightdepth.frame import flipped, to_batch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.losses import LossConfig, self_supervised_loss
 from lightdepth.metrics import inconsistency
+from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import NetworkConfig
 from lightdepth.photometry import PhotometricCalibration, irradiance
-from lightdepth.predict import NetworkModel
 from lightdepth.tube import lens
 from train.callbacks import validation_line
 from train.cli import train

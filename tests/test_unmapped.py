@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from densify.retrieval import frame_pairs, vlad
-from densify.unmapped import Matching, reasons, summary
-from lightdepth.importing.measures import Measures
+from lightdepth.image_quality import Measures
+from lightdepth.sfm.retrieval import frame_pairs, vlad
+from lightdepth.sfm.unmapped import Matching, reasons, summary
 
 USUAL = {"brightness": 120.0, "saturated": 0.02, "sharpness": 0.1}
 

@@ -38,11 +38,11 @@ from lightdepth.frame import FrameBatch, to_batch
 from lightdepth.geometry import depth_from_distance
 from lightdepth.losses import LossConfig, self_supervised_loss
 from lightdepth.metrics import DepthErrors
+from lightdepth.models import NetworkModel
 from lightdepth.module import MIN_RAY_Z
 from lightdepth.network import DepthNetwork
-from lightdepth.predict import NetworkModel
-from lightdepth.progress import Progress
-from lightdepth.run import plain, write_run_json
+from lightdepth.reporting.progress import Progress
+from lightdepth.reporting.run import plain, write_run_json
 from lightdepth.tube.variant import REFLECTANCE, variant_frames
 
 from .ablation_table import Result, Table, write_table

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lightdepth.run import git_revision
+from lightdepth.reporting.run import git_revision
 
 from .datamodule import TubeData, colon_seeds
 

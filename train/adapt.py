@@ -22,16 +22,16 @@ from lightdepth.calibration import write_camera, write_light
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model, save_model
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
-from lightdepth.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.frame import Frame
-from lightdepth.light_fit import LightView, fit_on_map, map_views, with_light, withheld_error
+from lightdepth.light.fit_on_map import LightView, fit_on_map, map_views, with_light, withheld_error
 from lightdepth.maps import read_map
 from lightdepth.maps.checks import check_shared_frames
+from lightdepth.models import DeclineModel, DepthModel, NetworkModel, working_size
 from lightdepth.photometry import PhotometricCalibration
-from lightdepth.predict import DeclineModel, DepthModel, NetworkModel, working_size
 from lightdepth.prediction import DepthPrediction
-from lightdepth.report import Report, number
-from lightdepth.run import Run, plain, run_folder, versions
+from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
+from lightdepth.reporting.report import Report, number
+from lightdepth.reporting.run import Run, plain, run_folder, versions
 from lightdepth.sparse_map import SparseMap
 
 from .adaptation import Adaptation, What, merge, source_colons, target_loss

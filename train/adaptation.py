@@ -24,10 +24,10 @@ from torch.nn.utils import parametrize
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch
 from lightdepth.losses import LossConfig, masked_mean, masked_median
+from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
 from lightdepth.network.model import full_precision
-from lightdepth.predict import NetworkModel
 
 from .datamodule import TubeData
 from .map_teacher import MapTeacher, map_terms

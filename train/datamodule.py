@@ -23,7 +23,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, flipped, to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.photometry import LightTerms, brightness, decode, encode
-from lightdepth.progress import Progress
+from lightdepth.reporting.progress import Progress
 from lightdepth.tube.scene import TubeConfig
 
 

@@ -32,10 +32,10 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from lightdepth.checkpoint import load_model, save_model
 from lightdepth.errors import InputError
+from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
-from lightdepth.predict import NetworkModel
-from lightdepth.run import input_hash, versions, write_run_json
+from lightdepth.reporting.run import input_hash, versions, write_run_json
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
 from .callbacks import Diagnosis, DiagnosisConfig, Panels, Progress, validation_line

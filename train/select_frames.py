@@ -18,10 +18,10 @@ import numpy as np
 
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
-from lightdepth.figures import BAD, GOOD, contact_sheet, png, thumbnail
 from lightdepth.maps import read_map
-from lightdepth.progress import Progress
-from lightdepth.report import Report
+from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
+from lightdepth.reporting.progress import Progress
+from lightdepth.reporting.report import Report
 from lightdepth.sparse_map import SparseMap
 
 from .covisibility import (

@@ -32,8 +32,8 @@ from densify.pipeline import DensifyConfig
 from densify.rectify import RectifyConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
-from lightdepth.progress import Progress
-from lightdepth.run import Run, git_revision, plain, run_folder, versions
+from lightdepth.reporting.progress import Progress
+from lightdepth.reporting.run import Run, git_revision, plain, run_folder, versions
 
 
 def bench(argv: list[str]) -> int:

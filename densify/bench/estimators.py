@@ -25,9 +25,9 @@ from densify.bending import BendingConfig
 from densify.tables import Table
 from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
-from lightdepth.figures import chart_png
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
+from lightdepth.reporting.figures import chart_png
 from lightdepth.robust import lmeds_scale
 from lightdepth.sparse_map import Keyframe
 

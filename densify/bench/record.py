@@ -17,7 +17,7 @@ from densify.bench.work import INLIERS, SPARSE, BenchConfig
 from densify.tables import Table
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
-from lightdepth.run import git_revision, plain, versions
+from lightdepth.reporting.run import git_revision, plain, versions
 
 COLUMNS = {
     "points": "#MP (×10³)",

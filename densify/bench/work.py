@@ -23,7 +23,7 @@ from densify.trajectory import align_trajectory, keyframe_trajectory
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
-from lightdepth.predict import DepthModel
+from lightdepth.models import DepthModel
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Submap
 

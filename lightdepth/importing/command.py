@@ -21,17 +21,17 @@ from lightdepth.camera import CameraModel
 from lightdepth.datasets.folder import write_times
 from lightdepth.datasets.sequence import border_mask, border_region
 from lightdepth.errors import InputError
-from lightdepth.figures import thumbnail
 from lightdepth.files.images import unit_range
+from lightdepth.image_quality import Measures, Meter, eight_bits, one_field
 from lightdepth.importing import findings as finding
 from lightdepth.importing.findings import Finding
-from lightdepth.importing.measures import Measures, Meter, eight_bits, one_field
 from lightdepth.importing.overlay import STRETCH, STRETCHES, Overlay, find_overlay
 from lightdepth.importing.page import Picture, import_page
 from lightdepth.importing.selection import BLURRED, FROZEN, KEPT, Choice, selected
 from lightdepth.importing.source import Source, content_hash, open_source
-from lightdepth.progress import Progress
-from lightdepth.run import Run, run_folder
+from lightdepth.reporting.figures import thumbnail
+from lightdepth.reporting.progress import Progress
+from lightdepth.reporting.run import Run, run_folder
 
 DEFAULT_RATE = 5.0
 _PICTURES, _EXAMPLES = 40, 8

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lightdepth.importing.measures import BLACK, Measures
+from lightdepth.image_quality import BLACK, Measures
 from lightdepth.importing.selection import BLURRED, FROZEN, KEPT, UNREADABLE
 
 LOW_RESOLUTION, SMALL_MASK, BLURRED_SHARE, SATURATED_SHARE = 240, 0.3, 0.3, 0.1

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from lightdepth.figures import BAD, GOOD, chart, chart_png, contact_sheet, png
+from lightdepth.image_quality import Measures
 from lightdepth.importing.findings import Finding, exposure_jumps
-from lightdepth.importing.measures import Measures
 from lightdepth.importing.selection import KEPT
-from lightdepth.report import Report
+from lightdepth.reporting.figures import BAD, GOOD, chart, chart_png, contact_sheet, png
+from lightdepth.reporting.report import Report
 
 Picture = tuple[np.ndarray, str, bool]
 """A thumbnail (h, w, 3), its label, and whether the frame was kept."""

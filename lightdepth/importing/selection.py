@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import percentile_filter
 
 from lightdepth.errors import InputError
-from lightdepth.importing.measures import Measures
+from lightdepth.image_quality import Measures
 
 SAME = 0.1
 """Mean difference of thumbnails, of 255, up to which a frame is the one before again."""

@@ -12,9 +12,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from sfm_videos import video
 
 from densify.evaluation import fit_similarity, rms_ate
-from densify.sfm import SfmConfig, SfmMap, sparse_map_from_frames
-from densify.unmapped import summary
 from lightdepth.errors import InputError
+from lightdepth.sfm.reconstruction import SfmConfig, SfmMap, sparse_map_from_frames
+from lightdepth.sfm.unmapped import summary
 from lightdepth.tube import lens
 
 # seed, lens, effect

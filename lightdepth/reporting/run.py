@@ -139,7 +139,7 @@ def versions() -> dict[str, str]:
 
 def git_revision() -> str | None:
     """Revision of the program's own checkout ("+" with uncommitted changes), or None outside one."""
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
     try:

@@ -8,7 +8,7 @@ blurs it, psi the angle of its ray from the axis, c one constant per keyframe (e
 is linear in gamma and mu. A map knows no normals, so every wall is taken as facing. What is found is the light with
 which the closed form errs least, not the endoscope's own: in a tube, where far walls are seen at a grazing angle, its
 gamma is the smaller one, by a third in the ideal case (cos ~ 1/a makes V^gamma ~ a^-3), and light from wall to wall
-makes it larger. lightdepth.light_truth finds the endoscope's own, from frames with known depth.
+makes it larger. lightdepth.light.fit_on_truth finds the endoscope's own, from frames with known depth.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from lightdepth.decline import BLUR, V_FLOOR, masked_blur
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, check_image_size, to_batch
 from lightdepth.maps.checks import check_shared_frames
+from lightdepth.models import ConstantModel, DeclineModel, working_size
 from lightdepth.observations import observed_distances
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness
-from lightdepth.predict import ConstantModel, DeclineModel, working_size
 from lightdepth.prediction import DepthPrediction
 from lightdepth.robust import lmeds_scale
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap

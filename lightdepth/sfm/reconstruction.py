@@ -23,16 +23,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from densify.retrieval import frame_pairs
-from densify.unmapped import Matching, reasons, summary
 from lightdepth.camera import CameraModel, KannalaBrandt, Scaramuzza
 from lightdepth.camera_conversion import Conversion, convert_camera
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, frame_number
-from lightdepth.importing.measures import Measures, Meter
+from lightdepth.image_quality import Measures, Meter
 from lightdepth.maps import read_map
 from lightdepth.maps.colmap import holds_model
 from lightdepth.native import pycolmap
+from lightdepth.sfm.retrieval import frame_pairs
+from lightdepth.sfm.unmapped import Matching, reasons, summary
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap, check_rigid
 
 log = logging.getLogger(__name__)

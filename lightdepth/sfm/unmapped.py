@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lightdepth.importing.measures import Measures
+from lightdepth.image_quality import Measures
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from lightdepth.figures import chart, chart_png
-from lightdepth.light_fit import LightFit
+from lightdepth.light.fit_on_map import LightFit
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU
-from lightdepth.report import Report
+from lightdepth.reporting.figures import chart, chart_png
+from lightdepth.reporting.report import Report
 
 
 def light_page(fit: LightFit, what: str) -> Report:

@@ -22,9 +22,9 @@ from lightdepth.decline import V_FLOOR, masked_blur
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, to_batch
 from lightdepth.geometry import normals_from_distance
-from lightdepth.light_fit import GAMMA_RANGE, MU_RANGE, SATURATED, LightFit
+from lightdepth.light.fit_on_map import GAMMA_RANGE, MU_RANGE, SATURATED, LightFit
+from lightdepth.models import working_size
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness
-from lightdepth.predict import working_size
 from lightdepth.radiosity import indirect_irradiance
 
 V_RANGE = (0.05, 0.75)  # darker is noise, brighter is where tone curves bend

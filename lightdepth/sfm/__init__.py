@@ -1,0 +1,1 @@
+"""A sparse map from frames alone, by pycolmap, where there is no SLAM output."""
