@@ -10,8 +10,8 @@ _HOMES = {
     "DensifyConfig": "densify.pipeline",
     "DenseMap": "densify.dense_map",
     "Alignment": "densify.alignment",
-    "TsdfVolume": "densify.fusion",
-    "Densifier": "densify.live",
+    "TsdfVolume": "densify.fusion.volume",
+    "Densifier": "densify.live.densifier",
 }
 __all__ = list(_HOMES)
 

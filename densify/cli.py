@@ -19,17 +19,17 @@ from densify.coverage import coverage as coverage_of
 from densify.dense_map import DenseMap
 from densify.densified import Densified
 from densify.doctor import examine
-from densify.fusion import FusionConfig
+from densify.evaluation.judge import dense_models, judge_maps, read_run, read_truth
+from densify.evaluation.page import densify_page, joined_section
+from densify.evaluation.tables import write_evaluations
+from densify.fusion.rectify import RectifyConfig
+from densify.fusion.volume import FusionConfig
 from densify.inputs import fitted_light, made_sparse, map_and_frames
 from densify.joining import MergeConfig
-from densify.judge import dense_models, judge_maps, read_run, read_truth
-from densify.live import LIVE_FUSION
+from densify.live.densifier import LIVE_FUSION
+from densify.live.play import play, time_spent, timings_picture, write_timings
 from densify.measure import chosen_map, measured, places_in_frame, run_unit, summary
-from densify.page import densify_page, joined_section
 from densify.pipeline import DensifyConfig
-from densify.play import play, time_spent, timings_picture, write_timings
-from densify.rectify import RectifyConfig
-from densify.tables import write_evaluations
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.commands import write_synthetic
 from lightdepth.datasets import FrameSequence, open_sequence

@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from densify.dense_map import Contribution, DenseMap
-from densify.rectify import FULL, SurfaceView
+from densify.fusion.rectify import FULL, SurfaceView
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Keyframe
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
+from densify.evaluation.page import Gallery
 from densify.joining import MergeConfig, Merged, joined_name, merge
-from densify.page import Gallery
 from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, densify
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from densify.fusion import FusionConfig, TsdfVolume
-from densify.rectify import RectifyConfig, surface_view
+from densify.fusion.rectify import RectifyConfig, surface_view
+from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth import native
 from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError

@@ -8,8 +8,7 @@ from typing import Any
 
 from densify.dense_map import map_folders
 from densify.densified import Densified
-from densify.inputs import map_and_frames
-from densify.judge import (
+from densify.evaluation.judge import (
     THRESHOLDS_MM,
     Evaluation,
     Model,
@@ -26,10 +25,11 @@ from densify.judge import (
     with_trajectories,
     withheld_errors,
 )
+from densify.evaluation.suite import Suite, present, read_suite
+from densify.evaluation.tables import write_evaluations
+from densify.evaluation.trajectory import read_trajectories, trajectory_files
+from densify.inputs import map_and_frames
 from densify.pipeline import DensifyConfig
-from densify.suite import Suite, present, read_suite
-from densify.tables import write_evaluations
-from densify.trajectory import read_trajectories, trajectory_files
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError

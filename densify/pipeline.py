@@ -16,9 +16,9 @@ from densify.bending import BendingConfig
 from densify.contradiction import ContradictionConfig, uncontradicted, without
 from densify.coverage import Coverage, CoverageConfig, contribution, coverage, looked_at
 from densify.dense_map import Contribution, DenseMap
-from densify.fusion import FusionConfig, TsdfVolume
-from densify.plain_fusion import PlainTsdf, undistorted
-from densify.rectify import RectifyConfig, surface_view
+from densify.fusion.plain import PlainTsdf, undistorted
+from densify.fusion.rectify import RectifyConfig, surface_view
+from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError

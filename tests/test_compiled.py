@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba.core.caching import CacheImpl
 
-from densify.compiled import compiled
+from densify.fusion.compiled import compiled
 
 
 def twice(values):

@@ -16,10 +16,10 @@ import trimesh
 from colons import colon, sequence, slam, truth
 
 from densify.evaluate_command import evaluate
-from densify.judge import Model, dense_models, judge_depth, judge_maps, read_run, read_truth
+from densify.evaluation.judge import Model, dense_models, judge_depth, judge_maps, read_run, read_truth
+from densify.evaluation.suite import alone
+from densify.evaluation.tables import Table, depth_table, long_rows, surface_table, trajectory_table, write_evaluations
 from densify.pipeline import DensifyConfig, densify
-from densify.suite import alone
-from densify.tables import Table, depth_table, long_rows, surface_table, trajectory_table, write_evaluations
 from lightdepth.datasets import write_folder
 from lightdepth.errors import InputError
 from lightdepth.files.tum import write_tum

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scenes import Scene, cylinder, slanted_plane, sphere
 
-from densify.fusion import STEPS, FusionConfig, Mesh, TsdfVolume
-from densify.marching_cubes import CORNERS, packed, unpacked
-from densify.rectify import FULL, RectifyConfig, SurfaceView, surface_view
+from densify.fusion.marching_cubes import CORNERS, packed, unpacked
+from densify.fusion.rectify import FULL, RectifyConfig, SurfaceView, surface_view
+from densify.fusion.volume import STEPS, FusionConfig, Mesh, TsdfVolume
 from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction

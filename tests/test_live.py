@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from densify.agreement import AgreementConfig
 from densify.contradiction import ContradictionConfig
 from densify.coverage import coverage
-from densify.fusion import FusionConfig
-from densify.live import Densifier
-from densify.packed import PackedView, Packing
+from densify.fusion.volume import FusionConfig
+from densify.live.densifier import Densifier
+from densify.live.packed import PackedView, Packing
 from densify.pipeline import DensifyConfig, densify_submap
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from colons import colon, slam, truth
 
-from densify.fusion import FusionConfig, TsdfVolume
-from densify.marching import BlockSurface, joined
-from densify.marching_cubes import CORNERS, packed, unpacked
-from densify.rectify import RectifyConfig, surface_view
+from densify.fusion.marching_cubes import CORNERS, packed, unpacked
+from densify.fusion.patches import BlockSurface, joined
+from densify.fusion.rectify import RectifyConfig, surface_view
+from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth.camera import Pinhole
 from lightdepth.prediction import DepthPrediction
 

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from densify.marching_cubes import CORNERS, EDGES, Cut, cut, one_vertex_an_edge, packed, triangle_table, unpacked
+from densify.fusion.marching_cubes import CORNERS, EDGES, Cut, cut, one_vertex_an_edge, packed, triangle_table, unpacked
 
 
 def cut_of(values: np.ndarray) -> Cut:

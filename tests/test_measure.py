@@ -13,9 +13,9 @@ from scenes import cylinder, slanted_plane, sphere
 from densify.alignment import Alignment
 from densify.cli import measure
 from densify.dense_map import DenseMap
-from densify.fusion import FusionConfig, TsdfVolume
+from densify.fusion.rectify import RectifyConfig, surface_view
+from densify.fusion.volume import FusionConfig, TsdfVolume
 from densify.measure import Wall, disc, on_wall, patch, path
-from densify.rectify import RectifyConfig, surface_view
 from lightdepth.errors import InputError
 from lightdepth.sparse_map import Keyframe, Submap
 from lightdepth.tube import lens

@@ -13,10 +13,10 @@ from colons import colon, sequence, slam
 from test_live import setting
 
 from densify.cli import live
-from densify.fusion import FusionConfig
-from densify.live import STEPS, StepTime
+from densify.fusion.volume import FusionConfig
+from densify.live.densifier import STEPS, StepTime
+from densify.live.play import Played, play, time_spent, timings_picture, write_timings
 from densify.pipeline import DensifyConfig
-from densify.play import Played, play, time_spent, timings_picture, write_timings
 from lightdepth.commands import write_synthetic
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError, PartialFailure

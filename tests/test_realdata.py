@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from densify.agreement import AgreementConfig
-from densify.evaluation import evaluate_depth
-from densify.judge import judge_gap, read_run
+from densify.evaluation.errors import evaluate_depth
+from densify.evaluation.judge import judge_gap, read_run
 from densify.pipeline import DensifyConfig, SubmapResult, densify, fitted_to_frames
 from lightdepth.datasets import FrameSequence, open_sequence, read_c3vd
 from lightdepth.frame import Frame

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scenes import Scene, cylinder, slanted_plane, sphere
 
-from densify.rectify import FULL, DirectionTable, RectifyConfig, SurfaceView, light_weight, surface_view
+from densify.fusion.rectify import FULL, DirectionTable, RectifyConfig, SurfaceView, light_weight, surface_view
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.prediction import DepthPrediction
 from lightdepth.tube import lens

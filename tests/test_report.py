@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from colons import colon, sequence, slam, truth
 
-from densify.page import Gallery, densify_page
+from densify.evaluation.page import Gallery, densify_page
 from densify.pipeline import DensifyConfig, densify
 from lightdepth.models import ConstantModel
 from lightdepth.reporting.figures import png

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scenes import cylinder
 
-from densify import second_core
-from densify.fusion import FusionConfig, TsdfVolume
-from densify.rectify import RectifyConfig, surface_view
-from densify.second_core import halves, later
+from densify.fusion import second_core
+from densify.fusion.rectify import RectifyConfig, surface_view
+from densify.fusion.second_core import halves, later
+from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth.tube import lens
 
 

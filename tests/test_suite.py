@@ -13,7 +13,7 @@ import yaml
 from colons import colon, slam
 
 from densify.evaluate_command import evaluate
-from densify.suite import present, read_suite
+from densify.evaluation.suite import present, read_suite
 from lightdepth.datasets import write_c3vd
 from lightdepth.datasets.c3vd import C3VD
 from lightdepth.datasets.splits import read_split

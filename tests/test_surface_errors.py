@@ -12,8 +12,7 @@ from scenes import PINHOLE, sphere
 from scipy.spatial.transform import Rotation
 
 from densify.dense_map import Surface
-from densify.evaluation import (
-    Similarity,
+from densify.evaluation.errors import (
     SurfaceErrors,
     TrueSurface,
     closest,
@@ -23,8 +22,9 @@ from densify.evaluation import (
     thinned,
     true_cloud,
 )
-from densify.judge import Model, Truth, judge_maps, read_mesh, read_truth
-from densify.trajectory import in_order
+from densify.evaluation.judge import Model, Truth, judge_maps, read_mesh, read_truth
+from densify.evaluation.trajectory import in_order
+from densify.similarity import Similarity
 from lightdepth.errors import InputError
 
 THRESHOLDS = (0.5, 1.0, 2.0)

@@ -9,8 +9,8 @@ import pytest
 from colons import colon, slam
 from scipy.spatial.transform import Rotation
 
-from densify.evaluation import Similarity, fit_similarity, rms_ate, sideways_agreement
-from densify.trajectory import (
+from densify.evaluation.errors import rms_ate, sideways_agreement
+from densify.evaluation.trajectory import (
     CLIMB_POSES,
     Trajectory,
     align_trajectory,
@@ -19,6 +19,7 @@ from densify.trajectory import (
     trajectory_files,
     trajectory_summary,
 )
+from densify.similarity import Similarity, fit_similarity
 from lightdepth.errors import InputError
 from lightdepth.files.tum import write_tum
 from lightdepth.maps import write_multimap

@@ -27,9 +27,9 @@ from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, Recipe, load_models, predicted, run_scene
 from densify.bending import BendingConfig
 from densify.contradiction import ContradictionConfig
-from densify.fusion import FusionConfig
+from densify.fusion.rectify import RectifyConfig
+from densify.fusion.volume import FusionConfig
 from densify.pipeline import DensifyConfig
-from densify.rectify import RectifyConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
 from lightdepth.reporting.progress import Progress

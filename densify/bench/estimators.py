@@ -22,7 +22,7 @@ import numpy as np
 from densify.agreement import AgreementConfig, View, agree
 from densify.alignment import AlignmentConfig, align, bent
 from densify.bending import BendingConfig
-from densify.tables import Table
+from densify.evaluation.tables import Table
 from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
 from lightdepth.observations import ObservedDistances

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from densify.bench.scenes import SUITE_VERSION
 from densify.bench.work import INLIERS, SPARSE, BenchConfig
-from densify.tables import Table
+from densify.evaluation.tables import Table
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.reporting.run import git_revision, plain, versions

@@ -25,7 +25,7 @@ import numpy as np
 
 from densify.bench.record import COLUMNS, BenchFile, figure
 from densify.bench.work import INLIERS, SPARSE
-from densify.tables import Table
+from densify.evaluation.tables import Table
 from lightdepth.errors import InputError
 
 Verdict = Literal["better", "worse", "within noise"]

@@ -16,10 +16,10 @@ import numpy as np
 
 from densify.bench.scenes import Rendered, Scene, Size, render
 from densify.dense_map import DenseMap
-from densify.evaluation import compare_depth, rms
-from densify.judge import Model, judge_maps
+from densify.evaluation.errors import compare_depth, rms
+from densify.evaluation.judge import Model, judge_maps
+from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
 from densify.pipeline import DensifyConfig, densify
-from densify.trajectory import align_trajectory, keyframe_trajectory
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame

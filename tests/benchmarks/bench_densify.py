@@ -24,9 +24,9 @@ from scipy.spatial import cKDTree
 from densify.agreement import AgreementConfig
 from densify.bending import BendingConfig
 from densify.contradiction import ContradictionConfig
-from densify.evaluation import true_cloud
+from densify.evaluation.errors import true_cloud
+from densify.fusion.rectify import RectifyConfig
 from densify.pipeline import DensifyConfig, SubmapResult, densify
-from densify.rectify import RectifyConfig
 from lightdepth import native
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence

@@ -19,10 +19,10 @@ from scenes import cylinder
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from densify.fusion import FusionConfig
-from densify.live import LIVE_FUSION, STEPS, Densifier
+from densify.fusion.volume import FusionConfig
+from densify.live.densifier import LIVE_FUSION, STEPS, Densifier
+from densify.live.play import play, time_spent
 from densify.pipeline import DensifyConfig
-from densify.play import play, time_spent
 from lightdepth.camera import CameraModel
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import FrameSequence

@@ -11,7 +11,8 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from sfm_videos import video
 
-from densify.evaluation import fit_similarity, rms_ate
+from densify.evaluation.errors import rms_ate
+from densify.similarity import fit_similarity
 from lightdepth.errors import InputError
 from lightdepth.sfm.reconstruction import SfmConfig, SfmMap, sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary

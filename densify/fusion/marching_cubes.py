@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from densify.compiled import compiled
+from densify.fusion.compiled import compiled
 
 BLOCK = 8
 """Voxels along the side of a block. Compiled code relies on it."""

@@ -6,7 +6,7 @@ move keyframes after a loop closure, by taking their depth out of the volume and
 it extracts only the part of the surface that changed.
 
 Memory: the blocks of the volume that a surface passes near (10 kB each), the triangles, and for each keyframe its
-packed depth and image (densify.packed, some 140 kB at 320x256) and its points.
+packed depth and image (densify.live.packed, some 140 kB at 320x256) and its points.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from densify.agreement import View, agree
 from densify.alignment import Alignment, align, bent
 from densify.coverage import contribution, looked_at
 from densify.dense_map import Contribution, DenseMap
-from densify.fusion import FusionConfig, TsdfVolume
-from densify.marching import BlockSurface, Patch, joined
-from densify.marching_cubes import unpacked
-from densify.packed import PackedView, Packing
+from densify.fusion.marching_cubes import unpacked
+from densify.fusion.patches import BlockSurface, Patch, joined
+from densify.fusion.rectify import SurfaceView, surface_view
+from densify.fusion.volume import FusionConfig, TsdfVolume
+from densify.live.packed import PackedView, Packing
 from densify.pipeline import DensifyConfig, Model, split_withheld, typical_distance
-from densify.rectify import SurfaceView, surface_view
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.images import unit_range

@@ -16,8 +16,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from densify.compiled import compiled
-from densify.second_core import halves
+from densify.fusion.compiled import compiled
+from densify.fusion.second_core import halves
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction

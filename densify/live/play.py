@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from densify.dense_map import DenseMap
-from densify.live import STEPS, Densifier, StepTime
+from densify.live.densifier import STEPS, Densifier, StepTime
 from densify.pipeline import DensifyConfig, Model, frame_of
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from densify.compiled import compiled
-from densify.second_core import later
+from densify.fusion.compiled import compiled
+from densify.fusion.second_core import later
 from lightdepth.camera import CameraModel
 from lightdepth.files.images import decode, unit_range
 from lightdepth.prediction import DepthPrediction

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from densify.evaluation import Similarity, ate, fit_similarity, rms, sideways_agreement
+from densify.evaluation.errors import ate, rms, sideways_agreement
+from densify.similarity import Similarity, fit_similarity
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
 from lightdepth.frame import frame_number

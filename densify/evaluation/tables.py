@@ -17,8 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from densify.judge import EDGES_MM, ErrorMesh, Evaluation, with_versions
-from densify.suite import Suite, alone
+from densify.evaluation.judge import EDGES_MM, ErrorMesh, Evaluation, with_versions
+from densify.evaluation.suite import Suite, alone
 from lightdepth.reporting.figures import chart, chart_png, mesh_picture, png, side_by_side
 from lightdepth.reporting.report import number
 

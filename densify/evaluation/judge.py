@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from densify.dense_map import DenseMapFiles, Surface, map_folders, read_dense_map, run_record
-from densify.evaluation import (
+from densify.evaluation.errors import (
     CUBE_MM,
-    Similarity,
     SurfaceErrors,
     TrueSurface,
     compare_depth,
@@ -27,7 +26,7 @@ from densify.evaluation import (
     true_cloud,
     true_depth,
 )
-from densify.trajectory import (
+from densify.evaluation.trajectory import (
     AlignedTrajectory,
     Trajectory,
     align_trajectory,
@@ -38,6 +37,7 @@ from densify.trajectory import (
     trajectory_files,
     trajectory_summary,
 )
+from densify.similarity import Similarity
 from lightdepth.datasets import FrameSequence
 from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from densify.compiled import compiled
-from densify.marching_cubes import BLOCK, CORNERS, REACH, Cut, cut, one_vertex_an_edge, packed
-from densify.rectify import FULL, SurfaceView
-from densify.second_core import halves
+from densify.fusion.compiled import compiled
+from densify.fusion.marching_cubes import BLOCK, CORNERS, REACH, Cut, cut, one_vertex_an_edge, packed
+from densify.fusion.rectify import FULL, SurfaceView
+from densify.fusion.second_core import halves
 from lightdepth.errors import InputError
 
 STEPS = 2048
@@ -55,7 +55,7 @@ class TsdfVolume:
     """A truncated signed distance volume that grows where surface is seen. `voxel` in map units.
 
     It grows in blocks of 8 x 8 x 8 voxels, each named by its place, counted in blocks and packed into one number
-    (densify.marching_cubes), and held in a slot.
+    (densify.fusion.marching_cubes), and held in a slot.
     """
 
     def __init__(self, voxel: float, config: FusionConfig):

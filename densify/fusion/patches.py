@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from densify.compiled import compiled
-from densify.fusion import TsdfVolume
-from densify.marching_cubes import one_vertex_an_edge
+from densify.fusion.compiled import compiled
+from densify.fusion.marching_cubes import one_vertex_an_edge
+from densify.fusion.volume import TsdfVolume
 
 
 class Patch(NamedTuple):

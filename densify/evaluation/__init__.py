@@ -1,0 +1,1 @@
+"""What is judged against truth, between submaps and by withheld points; its tables and pages."""

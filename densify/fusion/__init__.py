@@ -1,0 +1,1 @@
+"""Keyframes into one surface: rectified views, the signed distance volume, marching cubes; the paper's plain fusion."""
