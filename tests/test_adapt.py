@@ -16,8 +16,8 @@ from lightdepth.maps import write_multimap
 from lightdepth.models import NetworkModel
 from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
-from train.adapt import Judgement, Verdict, adapt, verdict
 from train.adaptation import Adaptation, anchor_loss, let_learn, merge, source_colons, target_loss
+from train.commands.adapt import Judgement, Verdict, adapt, verdict
 from train.datamodule import FrameDataModule, TubeData, collate
 
 SIZE = (40, 32)
@@ -140,7 +140,7 @@ def test_the_light_that_the_map_told_is_what_training_sees(start, sequences, tmp
         return original(self, batch)
 
     found = PhotometricCalibration(gamma=1.3, mu=0.7, source="measured")
-    monkeypatch.setattr("train.adapt._fitted_light", lambda *_: found)
+    monkeypatch.setattr("train.commands.adapt._fitted_light", lambda *_: found)
     monkeypatch.setattr(Adaptation, "batch_loss", spy)
     adapted(start, sequences / "unlit", tmp_path / "run", map=sequences / "slam", keep_worse=True, steps=2)
     assert len(seen) == 2 and np.allclose(seen, 1.3)

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.bench import command, verdict
-from densify.bench.command import bench
+from densify.bench import verdict
 from densify.bench.record import COLUMNS, read_bench
 from densify.bench.scenes import SUITE_VERSION, Scene, scenes
 from densify.bench.verdict import bootstrapped_mean, compare
 from densify.bench.work import BenchConfig
+from densify.commands import bench as command
+from densify.commands.bench import bench
 from lightdepth.errors import InputError
 from lightdepth.tube import ShapeConfig, TubeConfig
 

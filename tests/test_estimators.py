@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.bench.command import bench
 from densify.bench.estimators import (
     ESTIMATORS,
     EstimatorsConfig,
@@ -18,6 +17,7 @@ from densify.bench.estimators import (
     losses,
     question,
 )
+from densify.commands.bench import bench
 from lightdepth.errors import InputError
 
 

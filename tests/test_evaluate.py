@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from colons import colon, sequence, slam, truth
 
-from densify.evaluate_command import evaluate
+from densify.commands.evaluate import evaluate
 from densify.evaluation.judge import Model, dense_models, judge_depth, judge_maps, read_run, read_truth
 from densify.evaluation.suite import alone
 from densify.evaluation.tables import Table, depth_table, long_rows, surface_table, trajectory_table, write_evaluations

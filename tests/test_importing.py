@@ -12,12 +12,12 @@ from videos import CAMERA, OCTAGON, picture, uneven_times, write_video
 
 from lightdepth.calibration import write_camera
 from lightdepth.cli import _spelled_out, main
+from lightdepth.commands.import_frames import import_frames
 from lightdepth.datasets import FrameSequence, VideoFile, open_sequence, write_folder
 from lightdepth.datasets.sequence import border_mask
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.image_quality import Measures, Meter, one_field
-from lightdepth.importing.command import import_frames
 from lightdepth.importing.overlay import find_overlay
 from lightdepth.importing.selection import BLURRED, FROZEN, KEPT, PASSED, UNREADABLE, Choice, selected
 from lightdepth.models import DeclineModel, predict

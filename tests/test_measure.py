@@ -11,7 +11,7 @@ import pytest
 from scenes import cylinder, slanted_plane, sphere
 
 from densify.alignment import Alignment
-from densify.cli import measure
+from densify.commands.measure import measure
 from densify.dense_map import DenseMap
 from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume

@@ -21,6 +21,7 @@ from lightdepth.frame import Frame
 from lightdepth.maps import write_text_model
 from lightdepth.sparse_map import SparseMap
 from lightdepth.tube import ShapeConfig, TextureConfig, TubeConfig, lens
+from train.commands.select import select
 from train.covisibility import (
     BLUR,
     FEW_KEYFRAMES,
@@ -45,7 +46,6 @@ from train.matching import (
     SiftMatcher,
     epipolar_inliers,
 )
-from train.select_frames import select
 
 CAMERA = Pinhole(8, 8, 8.0, 8.0, 4.0, 4.0)
 RULES = NodeRules(similarity=0.9, min_matches=10, min_spread=0.0, min_views=3, max_skipped=2, min_frames=1, max_views=9)

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from colons import colon, slam
 
-from densify.evaluate_command import evaluate
+from densify.commands.evaluate import evaluate
 from densify.evaluation.suite import present, read_suite
 from lightdepth.datasets import write_c3vd
 from lightdepth.datasets.c3vd import C3VD

@@ -24,8 +24,8 @@ from lightdepth.frame import Frame
 from lightdepth.geometry import depth_from_distance
 from lightdepth.metrics import DepthErrors
 from lightdepth.tube import lens, tube_frames
-from train.adapt import adapt
 from train.cli import train
+from train.commands.adapt import adapt
 from train.datamodule import TubeData, tube_config
 
 SIZE = (80, 64)

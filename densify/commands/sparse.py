@@ -1,0 +1,56 @@
+"""The verb sparse: a sparse map by pycolmap."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from densify.inputs import made_sparse
+from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.errors import InputError
+from lightdepth.files.tum import read_tum
+from lightdepth.reporting.run import run_folder
+from lightdepth.sfm.reconstruction import SfmConfig
+
+
+def sparse(
+    data: Path,
+    output: Path,
+    format: str | None = None,
+    camera: Path | None = None,
+    mask: Path | None = None,
+    poses: str | None = None,
+    sfm: SfmConfig = SfmConfig(),
+    overwrite: bool = False,
+) -> None:
+    """A sparse map by pycolmap, where there is no SLAM output.
+
+    Args:
+        data: folder of frames
+        output: folder to make, with one COLMAP model per submap
+        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
+        camera: calibration file that wins over the folder's
+        mask: image, white where tissue shows
+        poses: where poses are known and points are only triangulated: truth, those of the sequence, or a TUM file
+            (world from camera) whose times are frame numbers
+        sfm: how frames are mapped
+        overwrite: replace a folder made before
+    """
+    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    with run_folder(output, "sparse", arguments, overwrite) as run:
+        run.hash_input("data", data)
+        frames = open_sequence(data, format, camera, None, mask)
+        made_sparse(run, frames, sfm, None if poses is None else _poses(poses, frames))
+
+
+def _poses(given: str, frames: FrameSequence) -> dict[int, np.ndarray]:
+    """Known poses (4, 4) by frame number."""
+    if given == "truth":
+        found = ((f.number, f.true_world_from_cam) for f in frames)
+        known = {number: pose for number, pose in found if pose is not None}
+        if not known:
+            raise InputError(f"{frames.source}: no frame has a pose; give --poses FILE, a TUM trajectory")
+        return known
+    times, poses = read_tum(Path(given))
+    return dict(zip(times.round().astype(int).tolist(), poses, strict=True))

@@ -1,0 +1,61 @@
+"""The verb calibrate-light: response and spread of an endoscope's light."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from lightdepth.calibration import write_light
+from lightdepth.datasets import open_sequence
+from lightdepth.errors import InputError
+from lightdepth.light.fit_on_map import fit_on_map
+from lightdepth.light.fit_on_truth import fit_on_truth
+from lightdepth.light.report import light_page
+from lightdepth.maps import read_map
+
+
+def calibrate_light(
+    data: Path,
+    output: Path,
+    map: Path | None = None,
+    format: str | None = None,
+    camera: Path | None = None,
+    mask: Path | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> None:
+    """The light of an endoscope: response and spread, from a sparse map or from frames with known depth.
+
+    Args:
+        data: folder of frames
+        output: light.json to write, with a report beside it (light.html)
+        map: COLMAP model(s) or a multi-map tree; left out, the frames' own true depth is needed
+        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
+        camera: camera.json; left out, the map's own camera, else the folder's
+        mask: image, white where tissue shows
+        seed: draws the bootstrap
+        overwrite: replace files made before
+    """
+    page_path = output.with_suffix(".html")
+    if output.is_dir() or output.suffix == ".html":
+        raise InputError(f"-o {output}: expected the name of a file to write, such as light.json")
+    made = [path for path in (output, page_path) if path.exists()]
+    if made and not overwrite:
+        raise InputError(f"{made[0]}: already there; choose another -o, or give --overwrite")
+    rng = np.random.default_rng(seed)
+    if map is None:
+        fit = fit_on_truth(open_sequence(data, format, camera, None, mask), rng)
+        what = f"{data}, frames with known depth"
+    else:
+        sparse_map = read_map(map)
+        frames = open_sequence(data, format, camera, None, mask, sparse_map.submaps[0].keyframes[0].camera)
+        fit = fit_on_map(frames, sparse_map, camera=frames[0].camera if camera is not None else None, rng=rng)
+        what = f"{data}, {sparse_map.source}"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    partial = output.with_name(f".{output.name}.partial")
+    for path, write in ((page_path, light_page(fit, what).write), (output, lambda p: write_light(fit.light, p))):
+        write(partial)
+        os.replace(partial, path)
+    print(f"light: {fit.summary()}\n{output}, {page_path}")

@@ -1,0 +1,58 @@
+"""The verb convert-camera: a calibration file in another format or lens model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from lightdepth import camera_conversion
+from lightdepth.calibration import read_camera, write_camera
+from lightdepth.datasets.sequence import read_mask
+from lightdepth.errors import InputError
+
+
+def convert_camera(
+    file: Path,
+    output: Path,
+    model: Literal["PINHOLE", "OPENCV", "OPENCV_FISHEYE", "SCARAMUZZA"] | None = None,
+    size: tuple[int, int] | None = None,
+    to: Literal["json", "vicalib", "opencv", "colmap", "ocamcalib", "intrinsics", "intrinsics4x4"] | None = None,
+    mask: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """A calibration file in another format, or as another lens model, and by how many pixels that differs.
+
+    Args:
+        file: any calibration that is read: camera.json, vicalib XML, OpenCV YAML, COLMAP, ocamcalib, intrinsics.txt
+        output: file to write
+        model: lens model to have instead, fitted by least squares; left out, the file's own
+        size: width and height of the images; the camera is resized to them (intrinsics.txt holds none and needs them)
+        to: format of the output; left out, by its name
+        mask: image, white where tissue shows: only these pixels count in the fit
+        overwrite: replace a file made before
+    """
+    if output.exists() and not overwrite:
+        raise InputError(f"{output}: already there; choose another -o, or give --overwrite")
+    camera = read_camera(file, size)
+    if size is not None and size != (camera.width, camera.height):
+        if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > 0.01:
+            raise InputError(
+                f"--size {size[0]} {size[1]}: {file} is for {camera.width}x{camera.height}; expected the same aspect"
+            )
+        camera = camera.resized(*size)
+    said = f"{camera.name}, as it was read"
+    if model is not None and model != camera.name:
+        counted = read_mask(mask) if mask is not None else None
+        if counted is not None and counted.shape != (camera.height, camera.width):
+            raise InputError(
+                f"{mask}: {counted.shape[1]}x{counted.shape[0]} pixels; expected {camera.width}x{camera.height}"
+            )
+        found = camera_conversion.convert_camera(camera, model, counted)
+        said = (
+            f"{model} in place of {camera.name}: residual {found.median_px:.2g} px (median), {found.max_px:.2g} px "
+            f"(largest), over the {100 * found.seen_share:.1f} % of the field that it can represent"
+        )
+        camera = found.camera
+    output.parent.mkdir(parents=True, exist_ok=True)
+    write_camera(camera, output, to)
+    print(f"{said}\n{output}")

@@ -1,0 +1,35 @@
+"""A synthetic sequence and its simulated SLAM export as folders on disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from lightdepth.datasets import write_c3vd, write_endomapper, write_folder
+from lightdepth.frame import Frame
+from lightdepth.maps import write_multimap
+from lightdepth.reporting.run import plain
+from lightdepth.tube.slam import SimulatedSlam
+
+
+def write_synthetic(frames: Sequence[Frame], export: SimulatedSlam, folder: Path, layout: str = "frames") -> None:
+    """The sequence (with truth) at `folder`, the SLAM export in slam/, what only the simulation knows in
+    truth/slam.json."""
+    if layout == "c3vd":
+        write_c3vd(frames, folder / "sequence")
+    elif layout == "endomapper":
+        write_endomapper(frames, folder / "sequence")
+        write_folder(frames, folder / "truth" / "sequence")
+    else:
+        write_folder(frames, folder)
+    write_multimap(export.map, folder / "slam")
+    known = {
+        str(i): {
+            "map_from_world": {"scale": s, "rotation": r.tolist(), "translation": t.tolist()},
+            "spurious_point_ids": export.spurious_ids[i].tolist(),
+        }
+        for i, (s, r, t) in export.map_from_world.items()
+    }
+    (folder / "truth").mkdir(exist_ok=True)
+    (folder / "truth" / "slam.json").write_text(json.dumps(plain(known)) + "\n")
