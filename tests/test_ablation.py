@@ -11,7 +11,7 @@ import pytest
 import torch
 from scenes import cylinder
 
-import train.ablation as ablation
+import train.ablation.run as ablation
 from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import save_model
 from lightdepth.cli import parse
@@ -20,10 +20,11 @@ from lightdepth.frame import to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
-from train.ablation import JudgedColons, Row, ablate
-from train.ablation_table import METRICS, Result, Table, clear, lines, markdown, write_table
+from train.ablation.run import JudgedColons, Row, ablate
+from train.ablation.table import METRICS, Result, Table, clear, lines, markdown, write_table
 from train.cli import training_parser
-from train.datamodule import FrameDataModule, TubeData, with_reflectance
+from train.colons import TubeData, with_reflectance
+from train.datamodule import FrameDataModule
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted((ROOT / "configs" / "ablation").glob("*.yaml"))
@@ -67,7 +68,7 @@ def cheap(monkeypatch):
         return [to_batch(frame, size) for _ in range(tube.frames)]
 
     monkeypatch.setattr("train.datamodule.tube_scene", scene)
-    monkeypatch.setattr("train.ablation.tube_scene", scene)
+    monkeypatch.setattr("train.ablation.run.tube_scene", scene)
     monkeypatch.setattr(ablation, "variant_frames", lambda *_: [cylinder(CAMERA).frame()])
     monkeypatch.setattr(ablation, "fit", untrained)
 

@@ -16,9 +16,10 @@ from lightdepth.maps import write_multimap
 from lightdepth.models import NetworkModel
 from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
-from train.adaptation import Adaptation, anchor_loss, let_learn, merge, source_colons, target_loss
+from train.adapting.module import Adaptation, anchor_loss, let_learn, merge, source_colons, target_loss
+from train.colons import TubeData
 from train.commands.adapt import Judgement, Verdict, adapt, verdict
-from train.datamodule import FrameDataModule, TubeData, collate
+from train.datamodule import FrameDataModule, collate
 
 SIZE = (40, 32)
 

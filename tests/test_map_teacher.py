@@ -8,7 +8,7 @@ from colons import EXACT, colon, slam
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.sparse_map import SparseMap
-from train.map_teacher import MapTeacher, map_terms
+from train.adapting.map_teacher import MapTeacher, map_terms
 
 SIZE = (48, 40)
 

@@ -24,8 +24,8 @@ from lightdepth.frame import Frame
 from lightdepth.maps import read_map
 from lightdepth.models import ConstantModel, DeclineModel
 from lightdepth.sparse_map import SparseMap
-from train.covisibility import SIFT_NODES, MapRules, select_by_map, select_by_matching
-from train.matching import OrientationDescriptor, SiftMatcher
+from train.selecting.covisibility import SIFT_NODES, MapRules, select_by_map, select_by_matching
+from train.selecting.matching import OrientationDescriptor, SiftMatcher
 
 SINUS = "example_training_data_root/bag_1/_start_004259_end_004629_stride_25_segment_13"
 

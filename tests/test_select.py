@@ -22,7 +22,9 @@ from lightdepth.maps import write_text_model
 from lightdepth.sparse_map import SparseMap
 from lightdepth.tube import ShapeConfig, TextureConfig, TubeConfig, lens
 from train.commands.select import select
-from train.covisibility import (
+from train.datamodule import FrameDataModule
+from train.frame_lists import read_frame_list
+from train.selecting.covisibility import (
     BLUR,
     FEW_KEYFRAMES,
     FEW_VIEWS,
@@ -37,8 +39,7 @@ from train.covisibility import (
     select_by_map,
     select_by_matching,
 )
-from train.datamodule import FrameDataModule, read_frame_list
-from train.matching import (
+from train.selecting.matching import (
     Agreement,
     LoftrMatcher,
     LoftrSettings,

@@ -30,7 +30,9 @@ from lightdepth.photometry import PhotometricCalibration, irradiance
 from lightdepth.tube import lens
 from train.callbacks import validation_line
 from train.cli import train
-from train.datamodule import FrameDataModule, TubeData, augmented, collate, read_frame_list
+from train.colons import TubeData
+from train.datamodule import FrameDataModule, augmented, collate
+from train.frame_lists import read_frame_list
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs" / "train").glob("*.yaml"))
 LIGHT = PhotometricCalibration(gain=100.0, position_mm=(1.0, 2.0, 0.5), direction=(0.1, -0.05, 1.0))

@@ -30,7 +30,8 @@ from lightdepth.tube.path import image_flow
 from lightdepth.tube.sensor import SensorConfig, draw_sensor, expose
 from lightdepth.tube.shape import make_shape
 from lightdepth.tube.variant import REFLECTANCE, VariantTube, variant_frames
-from train.datamodule import FrameDataModule, TubeData, tube_config, tube_scene
+from train.colons import TubeData, tube_config, tube_scene
+from train.datamodule import FrameDataModule
 
 SENSOR_EFFECTS = {
     "exposure": (0.4, 0.4),

@@ -6,68 +6,27 @@ resumed run sees what an uninterrupted one would have seen.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning.pytorch as pl
-import numpy as np
 import torch
-from torch.utils.data import ConcatDataset, DataLoader, Dataset, Sampler
+from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
-from lightdepth.datasets import FrameSequence, open_sequence
-from lightdepth.datasets.splits import Chosen, Split, check_apart, folders, read_split
+from lightdepth.datasets import FrameSequence
+from lightdepth.datasets.splits import check_apart, folders, read_split
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, flipped, to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.photometry import LightTerms, brightness, decode, encode
 from lightdepth.reporting.progress import Progress
-from lightdepth.tube.scene import TubeConfig
-
-
-@dataclass(frozen=True)
-class TubeData:
-    """Synthetic colons for training, drawn from the data's seed; validation scenes are others.
-
-    Args:
-        scenes: colons to train on, each with its own shape, texture and endoscope; 0 for none.
-        val_scenes: colons to validate on.
-        frames: per colon.
-        travel: mm along the colon over which its frames are spread.
-        lenses: in turn: c3vd, fisheye, pinhole, telescope.
-        mu: ends of the range of the light's spread.
-        gamma: ends of the range of the response.
-        reflectance: ends of the range of the wall's reflectance.
-        family: plain, realistic (polyps, mucus, motion blur and all else: lightdepth.tube.realistic), or mixed: one
-            scene of five is no colon but a hollow looked at from anywhere (lightdepth.tube.cavity), and every scene
-            has a field of view of its own.
-        scene: ranges of one's own instead of the family's; mu, gamma and reflectance above hold in any case.
-        device: to render on: auto (the GPU where there is one and the extra gpu is installed), cpu or cuda. The same
-            colons on any, up to rounding.
-    """
-
-    scenes: int = 0
-    val_scenes: int = 0
-    frames: int = 8
-    travel: float = 60.0
-    lenses: tuple[str, ...] = ("c3vd", "fisheye", "pinhole")
-    mu: tuple[float, float] = (0.0, 3.5)
-    gamma: tuple[float, float] = (1.8, 2.6)
-    reflectance: tuple[float, float] = (0.0, 0.7)
-    family: Literal["plain", "realistic", "mixed"] = "plain"
-    scene: TubeConfig | None = None
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-
+from train.colons import TubeData, colon_seeds, tube_scene, with_reflectance
+from train.frame_lists import Listed, Reading, listed_rows, open_listed
+from train.order import Halves, Shuffled
 
 _NO_TUBE = TubeData()
 _WHITE = LossConfig().white
-_MAX_REFLECTANCE = 0.95
-_VAL_SEEDS = 1_000_000  # validation colons are drawn from here on, so that more scenes never run into them
-_SEEDS_APART = 10_000
-_FIELD = 17  # tells the draw of the field of view from the colon's own
-_HOLLOWS = (2,)  # of five; lenses, in turn, meet both families
 
 
 class FrameDataModule(pl.LightningDataModule):
@@ -152,7 +111,7 @@ class FrameDataModule(pl.LightningDataModule):
         train: list[Dataset] = []
         val: list[Dataset] = []
         to_train, to_validate = self._folders()
-        opened = [(path, _open(path, of, self.reading)) for path, of in to_train]
+        opened = [(path, open_listed(path, of, self.reading)) for path, of in to_train]
         rows = [list(range(len(frames))) for _, frames in opened]
         if self.frames is not None:
             if len(dict(opened)) < len(opened):
@@ -169,7 +128,7 @@ class FrameDataModule(pl.LightningDataModule):
             if held_out:
                 val.append(_Frames(chosen[-held_out:], self.size, path))
         for path, of in to_validate:
-            val.append(_Frames(_open(path, of, self.reading), self.size, path))
+            val.append(_Frames(open_listed(path, of, self.reading), self.size, path))
         if self.tube.scenes + self.tube.val_scenes > 0:
             with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
                 to_train_on, to_validate_on = colon_seeds(self.tube, self.seed)
@@ -232,13 +191,13 @@ class FrameDataModule(pl.LightningDataModule):
         first = batch * self.batch_size
         return [everyone[i] for i in list(order)[first : first + self.batch_size]]
 
-    def _order(self) -> _Shuffled:
+    def _order(self) -> Shuffled:
         assert self._train is not None
         colons = sum(len(part) for part in self._train.datasets if isinstance(part, _Cached))  # type: ignore[arg-type]
         frames = len(self._train) - colons
         if self.halves and frames and colons:
-            return _Halves(frames, colons, self.batch_size, self.seed)
-        return _Shuffled(len(self._train), self.seed)
+            return Halves(frames, colons, self.batch_size, self.seed)
+        return Shuffled(len(self._train), self.seed)
 
     def train_dataloader(self) -> DataLoader:
         assert self._train is not None
@@ -305,121 +264,6 @@ def augmented(batch: FrameBatch, generator: torch.Generator) -> FrameBatch:
     return batch._replace(image=torch.where(brightness(batch.image) >= _WHITE, batch.image, exposed))
 
 
-def colon_seeds(tube: TubeData, seed: int) -> tuple[range, range]:
-    """The colons that data of a seed train and validate on."""
-    first = seed * _SEEDS_APART
-    return range(first, first + tube.scenes), range(first + _VAL_SEEDS, first + _VAL_SEEDS + tube.val_scenes)
-
-
-def with_reflectance(batch: FrameBatch, reflectance: torch.Tensor) -> FrameBatch:
-    """The batch with another reflectance (B, 1, 1, 1) of the wall, kept where light from wall to wall converges."""
-    return batch._replace(light=batch.light._replace(reflectance=reflectance.clamp(0, _MAX_REFLECTANCE)))
-
-
-def tube_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> list[FrameBatch]:
-    """The frames of one synthetic colon, as batches of one."""
-    from lightdepth.tube import any_field, lens, tube_frames
-
-    camera, config = lens(tube.lenses[index % len(tube.lenses)], *size), tube_config(tube, index)
-    mask = any_field(camera, np.random.default_rng([seed, _FIELD])) if tube.family == "mixed" else None
-    frames = tube_frames(seed, tube.frames, camera, tube.travel, config, mask=mask, device=tube.device)
-    return [to_batch(frame, size) for frame in frames]
-
-
-def tube_config(tube: TubeData, index: int = 0) -> TubeConfig:
-    """What the index-th colon and its endoscope are drawn from."""
-    from lightdepth.tube import cavity, realistic
-
-    family = TubeConfig()
-    if tube.family != "plain":
-        family = cavity() if tube.family == "mixed" and index % 5 in _HOLLOWS else realistic()
-    config = tube.scene or family
-    return replace(config, sensor=replace(config.sensor, mu=tube.mu, gamma=tube.gamma, reflectance=tube.reflectance))
-
-
-def read_frame_list(path: Path) -> list[str]:
-    """Frame names, one a line; empty lines and lines that start with # are skipped."""
-    try:
-        lines = [line.strip() for line in path.read_text().splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a list of frame names ({error})") from error
-    names = [line for line in lines if line and not line.startswith("#")]
-    if not names:
-        raise InputError(f"{path}: no frame names in it; expected one a line, as `lightdepth select` writes")
-    return names
-
-
-@dataclass(frozen=True)
-class Listed:
-    """An entry of a split."""
-
-    split: Split
-    chosen: Chosen
-
-
-@dataclass(frozen=True)
-class Reading:
-    """How sequences are read: what is given wins over what is in their folders."""
-
-    format: str | None = None
-    camera: str | None = None
-    light: str | None = None
-    mask: str | None = None
-
-    def open(self, path: str, format: str | None = None) -> FrameSequence:
-        return open_sequence(path, self.format or format, self.camera, self.light, self.mask)
-
-
-def _open(path: str, of: Listed | None, reading: Reading) -> FrameSequence:
-    if of is None:
-        return reading.open(path)
-    info, expected = of.split.info, of.split.frame_count(of.chosen.name)
-    frames = reading.open(path, None if info is None else info.format)
-    if expected is not None and len(frames) != expected:
-        warnings.warn(f"{path}: {len(frames)} frames; the data set has {expected}. Is it there whole?", stacklevel=2)
-    rows = [i for i, number in enumerate(frames.numbers) if of.chosen.takes(number)]
-    if not rows:
-        raise InputError(
-            f"{path}: no frame in {of.chosen}; its numbers are {frames.numbers[0]} to {frames.numbers[-1]}"
-        )
-    return frames.at(rows)
-
-
-def listed_rows(path: Path, sequences: Mapping[str, FrameSequence]) -> dict[str, list[int]]:
-    """Rows of the listed frames in each sequence, in its order; a frame's ending does not count.
-
-    An entry `folder/name` is a frame of the sequence whose path ends in `folder`. Raises InputError for one that is in
-    no sequence, or in several.
-    """
-    rows: dict[str, set[int]] = {where: set() for where in sequences}
-    known: dict[str, list[tuple[str, int]]] = {}
-    for where, frames in sequences.items():
-        for i, name in enumerate(frames.names):
-            known.setdefault(_stem(name), []).append((where, i))
-    found: dict[str, list[tuple[str, int]]] = {}
-    for entry in read_frame_list(path):
-        *folders, name = entry.replace("\\", "/").split("/")
-        ends = {where: Path(where).resolve().parts[-len(folders) :] == tuple(folders) for where in sequences}
-        found[entry] = [(where, i) for where, i in known.get(_stem(name), []) if not folders or ends[where]]
-    if not any(found.values()):
-        raise InputError(f"{path}: none of the {len(found)} listed frames is in {' or '.join(sequences)}")
-    for entry, places in found.items():
-        if not places:
-            raise InputError(f"{path}: {entry} is not a frame of {' or '.join(sequences)}")
-        if len(places) > 1:
-            raise InputError(f"{path}: {entry} is in {' and in '.join(w for w, _ in places)}; write folder/name")
-        rows[places[0][0]].add(places[0][1])
-    return {where: sorted(chosen) for where, chosen in rows.items()}
-
-
-def _stem(name: str) -> str:
-    """The name without folder and without the ending of an image; dots in names are kept."""
-    from lightdepth.datasets.sequence import IMAGE_SUFFIXES
-
-    last = Path(name)
-    return last.stem if last.suffix.lower() in IMAGE_SUFFIXES else last.name
-
-
 class _Frames(Dataset):
     """Frames read when asked for, at one size."""
 
@@ -443,35 +287,3 @@ class _Cached(Dataset):
 
     def __getitem__(self, index: int) -> FrameBatch:
         return self.batches[index]
-
-
-class _Shuffled(Sampler[int]):
-    """A new order every epoch, which follows from seed and epoch. Lightning calls `set_epoch`."""
-
-    def __init__(self, count: int, seed: int) -> None:
-        self.count, self.seed, self.epoch = count, seed, 0
-
-    def set_epoch(self, epoch: int) -> None:
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(np.random.default_rng((self.seed, self.epoch)).permutation(self.count).tolist())
-
-
-class _Halves(_Shuffled):
-    """An epoch goes once through the first `frames` rows, in batches filled up from the `colons` rows behind them."""
-
-    def __init__(self, frames: int, colons: int, batch_size: int, seed: int) -> None:
-        self.frames, self.colons, self.second = frames, colons, batch_size // 2
-        self.first = batch_size - self.second
-        self.batches = max(1, frames // self.first)
-        super().__init__(self.batches * batch_size, seed)
-
-    def __iter__(self) -> Iterator[int]:
-        rng = np.random.default_rng((self.seed, self.epoch))
-        frames = np.resize(rng.permutation(self.frames), (self.batches, self.first))
-        colons = self.frames + np.resize(rng.permutation(self.colons), (self.batches, self.second))
-        return iter(np.concatenate([frames, colons], 1).ravel().tolist())

@@ -25,8 +25,8 @@ from lightdepth.geometry import depth_from_distance
 from lightdepth.metrics import DepthErrors
 from lightdepth.tube import lens, tube_frames
 from train.cli import train
+from train.colons import TubeData, tube_config
 from train.commands.adapt import adapt
-from train.datamodule import TubeData, tube_config
 
 SIZE = (80, 64)
 SOURCE = TubeData(lenses=("pinhole",), mu=(0.0, 0.5), gamma=(2.4, 2.6), reflectance=(0.0, 0.2), family="plain")

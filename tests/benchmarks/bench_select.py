@@ -17,8 +17,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from bad_stretches import Stretches, bad_stretches
 
 from lightdepth.tube import lens
-from train.covisibility import SIFT_NODES, NodeRules, select_by_matching
-from train.matching import OrientationDescriptor, SiftMatcher
+from train.selecting.covisibility import SIFT_NODES, NodeRules, select_by_matching
+from train.selecting.matching import OrientationDescriptor, SiftMatcher
 
 # seed, lens, size, frames, mm a frame
 CALIBRATION = [

@@ -13,7 +13,7 @@ import pytest
 from lightdepth.checkpoint import load_model
 from lightdepth.tube import lens, tube_frames
 from lightdepth.uncertainty import LEVELS, chart_png, coverage, doubted, sparsification, summary
-from train.datamodule import TubeData, tube_config
+from train.colons import TubeData, tube_config
 
 SEEDS = range(42000, 42018)
 

@@ -34,10 +34,10 @@ from lightdepth.reporting.report import Report, number
 from lightdepth.reporting.run import Run, plain, run_folder, versions
 from lightdepth.sparse_map import SparseMap
 
-from ..adaptation import Adaptation, What, merge, source_colons, target_loss
+from ..adapting.map_teacher import MapTeacher
+from ..adapting.module import Adaptation, What, merge, source_colons, target_loss
 from ..callbacks import Diagnosis, DiagnosisConfig, Progress
 from ..datamodule import FrameDataModule, held_out_count
-from ..map_teacher import MapTeacher
 from ..running import card_text, quiet, report_every
 
 _LEAST_VIEWS = 3  # held-out keyframes below which the map's other keyframes judge too

@@ -24,7 +24,7 @@ from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.report import Report
 from lightdepth.sparse_map import SparseMap
 
-from ..covisibility import (
+from ..selecting.covisibility import (
     LOFTR_NODES,
     SIFT_NODES,
     MapRules,
@@ -34,7 +34,7 @@ from ..covisibility import (
     select_by_map,
     select_by_matching,
 )
-from ..matching import LoftrMatcher, LoftrSettings, Matcher, OrientationDescriptor, SiftMatcher, SiftSettings
+from ..selecting.matching import LoftrMatcher, LoftrSettings, Matcher, OrientationDescriptor, SiftMatcher, SiftSettings
 
 _SHOWN = 48  # pictures of kept and of rejected frames each
 

@@ -28,7 +28,7 @@ from lightdepth.frame import FrameBatch, to_batch
 from lightdepth.robust import lmeds_scale, robust_weights
 from lightdepth.sparse_map import SparseMap, covisibility
 
-from .datamodule import collate
+from ..datamodule import collate
 
 LEAST_POINTS = 8  # as many as alignment asks of a keyframe
 _NEIGHBOURS = 4  # keyframes that each meets: those that share most points with it

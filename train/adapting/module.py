@@ -6,7 +6,7 @@ self-supervised one, free of gain, on frames of the target; on top of it
     anchor · mean |r - median r|,  r = log t - log t_start          (the start's shape holds, its scale need not)
 
 and in the second half of each batch, where there is replay, synthetic colons with the loss that the start learned from.
-Where a map teaches (train.map_teacher), its two terms come on top, from one or two more images in every step.
+Where a map teaches (train.adapting.map_teacher), its two terms come on top, from one or two more images in every step.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
 from lightdepth.network.model import full_precision
 
-from .datamodule import TubeData
+from ..colons import TubeData
 from .map_teacher import MapTeacher, map_terms
 
 What = Literal["all", "decoder", "norms", "low_rank"]

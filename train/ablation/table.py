@@ -22,10 +22,10 @@ import numpy as np
 
 from lightdepth.reporting.run import git_revision
 
-from .datamodule import TubeData, colon_seeds
+from ..colons import TubeData, colon_seeds
 
 if TYPE_CHECKING:
-    from .ablation import JudgedColons, Row
+    from .run import JudgedColons, Row
 
 METRICS = {"abs_rel": "AbsRel", "rmse_mm": "RMSE", "medae_mm": "MedAE"}
 _TOLD = {"true": "the true one", "wrong": "one .3 too high", "estimated": "one estimated per colon, without truth"}

@@ -45,11 +45,12 @@ from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import plain, write_run_json
 from lightdepth.tube.variant import REFLECTANCE, variant_frames
 
-from .ablation_table import Result, Table, write_table
-from .cli import as_yaml, training_parser
-from .datamodule import FrameDataModule, TubeData, collate, colon_seeds, tube_scene, with_reflectance
-from .fit import fit
-from .running import quiet
+from ..cli import as_yaml, training_parser
+from ..colons import TubeData, colon_seeds, tube_scene, with_reflectance
+from ..datamodule import FrameDataModule, collate
+from ..fit import fit
+from ..running import quiet
+from .table import Result, Table, write_table
 
 FARTHEST_MM = 100.0
 WRONG_BY = 0.3

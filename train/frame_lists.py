@@ -1,0 +1,95 @@
+"""Frames by name: lists that `select` writes, entries of a split, and how their sequences are opened."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.datasets.splits import Chosen, Split
+from lightdepth.errors import InputError
+
+
+def read_frame_list(path: Path) -> list[str]:
+    """Frame names, one a line; empty lines and lines that start with # are skipped."""
+    try:
+        lines = [line.strip() for line in path.read_text().splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a list of frame names ({error})") from error
+    names = [line for line in lines if line and not line.startswith("#")]
+    if not names:
+        raise InputError(f"{path}: no frame names in it; expected one a line, as `lightdepth select` writes")
+    return names
+
+
+@dataclass(frozen=True)
+class Listed:
+    """An entry of a split."""
+
+    split: Split
+    chosen: Chosen
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How sequences are read: what is given wins over what is in their folders."""
+
+    format: str | None = None
+    camera: str | None = None
+    light: str | None = None
+    mask: str | None = None
+
+    def open(self, path: str, format: str | None = None) -> FrameSequence:
+        return open_sequence(path, self.format or format, self.camera, self.light, self.mask)
+
+
+def open_listed(path: str, of: Listed | None, reading: Reading) -> FrameSequence:
+    if of is None:
+        return reading.open(path)
+    info, expected = of.split.info, of.split.frame_count(of.chosen.name)
+    frames = reading.open(path, None if info is None else info.format)
+    if expected is not None and len(frames) != expected:
+        warnings.warn(f"{path}: {len(frames)} frames; the data set has {expected}. Is it there whole?", stacklevel=2)
+    rows = [i for i, number in enumerate(frames.numbers) if of.chosen.takes(number)]
+    if not rows:
+        raise InputError(
+            f"{path}: no frame in {of.chosen}; its numbers are {frames.numbers[0]} to {frames.numbers[-1]}"
+        )
+    return frames.at(rows)
+
+
+def listed_rows(path: Path, sequences: Mapping[str, FrameSequence]) -> dict[str, list[int]]:
+    """Rows of the listed frames in each sequence, in its order; a frame's ending does not count.
+
+    An entry `folder/name` is a frame of the sequence whose path ends in `folder`. Raises InputError for one that is in
+    no sequence, or in several.
+    """
+    rows: dict[str, set[int]] = {where: set() for where in sequences}
+    known: dict[str, list[tuple[str, int]]] = {}
+    for where, frames in sequences.items():
+        for i, name in enumerate(frames.names):
+            known.setdefault(_stem(name), []).append((where, i))
+    found: dict[str, list[tuple[str, int]]] = {}
+    for entry in read_frame_list(path):
+        *folders, name = entry.replace("\\", "/").split("/")
+        ends = {where: Path(where).resolve().parts[-len(folders) :] == tuple(folders) for where in sequences}
+        found[entry] = [(where, i) for where, i in known.get(_stem(name), []) if not folders or ends[where]]
+    if not any(found.values()):
+        raise InputError(f"{path}: none of the {len(found)} listed frames is in {' or '.join(sequences)}")
+    for entry, places in found.items():
+        if not places:
+            raise InputError(f"{path}: {entry} is not a frame of {' or '.join(sequences)}")
+        if len(places) > 1:
+            raise InputError(f"{path}: {entry} is in {' and in '.join(w for w, _ in places)}; write folder/name")
+        rows[places[0][0]].add(places[0][1])
+    return {where: sorted(chosen) for where, chosen in rows.items()}
+
+
+def _stem(name: str) -> str:
+    """The name without folder and without the ending of an image; dots in names are kept."""
+    from lightdepth.datasets.sequence import IMAGE_SUFFIXES
+
+    last = Path(name)
+    return last.stem if last.suffix.lower() in IMAGE_SUFFIXES else last.name

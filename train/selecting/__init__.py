@@ -1,0 +1,1 @@
+"""Frames worth training on: by covisibility, and the matching that tells it."""
