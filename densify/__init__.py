@@ -7,7 +7,7 @@ from typing import Any
 
 _HOMES = {
     "densify": "densify.pipeline",
-    "DensifyConfig": "densify.pipeline",
+    "DensifyConfig": "densify.config",
     "DenseMap": "densify.dense_map",
     "Alignment": "densify.alignment",
     "TsdfVolume": "densify.fusion.volume",

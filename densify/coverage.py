@@ -7,7 +7,7 @@ missing wall; the rims at the two ends of a piece of tube, and the outer rim of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from densify.dense_map import Contribution, DenseMap
 from densify.fusion.rectify import FULL, SurfaceView
+from lightdepth.datasets import FrameSequence
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Keyframe
 
@@ -128,6 +129,23 @@ def looked_at(dense: DenseMap, keyframe: Keyframe, given: Contribution, stride: 
     if not len(corners):
         return given
     return replace(given, confidence=float(dense.confidence[corners].mean()), views=float(dense.views[corners].mean()))
+
+
+def with_contributions(dense: DenseMap, given: Mapping[str, Contribution]) -> DenseMap:
+    """The dense map with what each of its aligned keyframes gave, by name, and what it looks at."""
+    found = {k.name: looked_at(dense, k, given[k.name]) for k in dense.submap.keyframes if k.name in given}
+    return replace(dense, contributions=found)
+
+
+def seen_share(dense: DenseMap, frames: FrameSequence, stride: int = 8) -> float:
+    """Share of the aligned keyframes' masked pixels, every stride-th each way, whose rays meet the surface."""
+    hits = total = 0
+    for keyframe in dense.aligned_keyframes:
+        rows, columns = frames.of_keyframe(keyframe).valid[::stride, ::stride].nonzero()
+        rays = keyframe.camera.rays()[0][::stride, ::stride][rows, columns]
+        hits += int(np.isfinite(dense.surface.cast(keyframe.center, rays @ keyframe.cam_from_map[:3, :3])).sum())
+        total += len(rays)
+    return hits / max(total, 1)
 
 
 def find_holes(vertices: np.ndarray, triangles: np.ndarray) -> list[tuple[float, np.ndarray]]:

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from densify.alignment import Alignment
+from densify.fusion.volume import TsdfVolume
 from lightdepth import native
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.schema import read_json
 from lightdepth.files.tum import read_tum, write_tum
-from lightdepth.sparse_map import Submap
+from lightdepth.sparse_map import Keyframe, Submap
 
 GREEN, RED, GREY = (0, 170, 60), (220, 30, 30), (150, 150, 150)
 
@@ -93,6 +94,19 @@ class DenseMap:
     views: np.ndarray | None = None
     contributions: Mapping[str, Contribution] = field(default_factory=dict)
 
+    @classmethod
+    def of(cls, volume: TsdfVolume, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
+        """The surface in a volume, as it is now."""
+        m = volume.extract_mesh()
+        surface = (m.vertices, m.triangles, m.colors)
+        return cls(submap, *surface, alignments, volume.voxel, weights=m.weights, views=m.views)
+
+    @classmethod
+    def empty(cls, submap: Submap, reason: str) -> DenseMap:
+        """No surface, and the reason with every keyframe."""
+        alignments = tuple(Alignment(k.name, reason=reason) for k in submap.keyframes)
+        return cls(submap, np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)), alignments, 0.0)
+
     @property
     def confidence(self) -> np.ndarray | None:
         """In [0, 1): w / (1 + w) of a vertex's weight w; one half is one view that nothing speaks against."""
@@ -101,6 +115,10 @@ class DenseMap:
     @property
     def aligned(self) -> list[Alignment]:
         return [a for a in self.alignments if a.ok]
+
+    @property
+    def aligned_keyframes(self) -> list[Keyframe]:
+        return [k for k, a in zip(self.submap.keyframes, self.alignments, strict=True) if a.ok]
 
     @cached_property
     def surface(self) -> Surface:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
+from densify.aligned import AlignedKeyframe
+from densify.config import DensifyConfig
 from densify.evaluation.page import Gallery
 from densify.joining import MergeConfig, Merged, joined_name, merge
-from densify.pipeline import DensifyConfig, KeyframeView, SubmapResult, densify
+from densify.pipeline import SubmapResult, densify
+from densify.predictions import Seen
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.models import DepthModel
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, plain
-from lightdepth.sparse_map import SparseMap
+from lightdepth.sparse_map import SparseMap, Submap
 
 
 @dataclass
@@ -40,8 +43,8 @@ class Densified:
         count = sum(len(s.keyframes) for s in sparse_map.submaps)
         with Progress("Densifying", count) as bar:
 
-            def show(view: KeyframeView) -> None:
-                gallery(view)
+            def show(submap: Submap, aligned: AlignedKeyframe, seen: Seen) -> None:
+                gallery(submap, aligned, seen)
                 bar.advance()
 
             results = densify(frames, sparse_map, model, config, show)
@@ -49,13 +52,29 @@ class Densified:
         if config.withhold:
             with Progress("Constant distance, for comparison", count) as bar:
                 # At one scale per keyframe: bent to the points of the map, a constant would be the map's merit.
-                rigid = replace(config, agreement=replace(config.agreement, on=False))
-                baselines = densify(frames, sparse_map, load_model("constant"), rigid, lambda _: bar.advance())
+                baselines = densify(
+                    frames, sparse_map, load_model("constant"), config.rigid(), lambda *_: bar.advance()
+                )
         merged = None
         if merging is not None and len(results) > 1:
             with Progress("Joining submaps", count) as bar:
-                merged = merge(results, frames, model, config, merging, lambda _: bar.advance())
+                merged = merge(results, frames, model, config, merging, lambda *_: bar.advance())
         return cls(model.name, results, baselines, gallery, merged)
+
+    def notes(self, of: str, frames: FrameSequence, light_fit: Mapping[str, object] | None) -> list[str]:
+        """Sentences for the page: what the surfaces were made of (`of`), under which light, and what is weak."""
+        light = frames[0].light
+        under = f"gamma {light.gamma:.3g}, mu {light.mu:.3g} ({light.source})"
+        notes = [f"{of}; depth by {self.model}; light of the frames: {under}."]
+        notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
+        submaps = [result.dense.submap for result in self.results]
+        weak = [str(s.id) for s in submaps if s.weak_visibility]
+        if weak:
+            notes.append(
+                f"Map {', '.join(weak)} came without observations: which points a keyframe saw was guessed by "
+                "projection, so scales and inliers rest on weaker ground."
+            )
+        return notes
 
     def write(self, run: Run, formats: tuple[str, ...], mm_per_unit: float | None) -> None:
         """Every surface's folder, its figures in run.json and a line for the user. Raises InputError when none was

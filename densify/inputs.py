@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from densify.pipeline import fitted_to_frames
-from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.camera import CameraModel
+from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.errors import InputError
+from lightdepth.frame import check_image_size
 from lightdepth.light.fit_on_map import fit_on_map, with_light
 from lightdepth.maps import read_map
 from lightdepth.maps.checks import check_shared_frames
@@ -20,33 +22,32 @@ from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.reconstruction import SfmConfig, sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
-from lightdepth.sparse_map import SparseMap
+from lightdepth.sparse_map import Keyframe, SparseMap
 
 
 def map_and_frames(
-    run: Run,
-    data: Path,
-    map: Path | None,
-    format: str | None,
-    camera: Path | None,
-    light: str | None,
-    mask: Path | None,
-    sfm: SfmConfig,
+    run: Run, source: SequenceSource, map: Path | None, sfm: SfmConfig
 ) -> tuple[SparseMap, FrameSequence]:
     """The map at `map`, or one made of the frames, and the frames, under the map's camera where they have none. A map
     made at another image size is rescaled to theirs. Raises InputError where no frame is of the map."""
     if map is None:
-        frames = open_sequence(data, format, camera, light, mask)
+        frames = source.open()
         return made_sparse(run, frames, sfm), frames
     sparse_map = read_map(map)
     map_camera = sparse_map.submaps[0].keyframes[0].camera
-    frames = open_sequence(data, format, camera, light, mask, map_camera)
+    frames = source.open(map_camera)
     check_shared_frames(sparse_map, frames)
     width, height = frames.image_size()
-    given = frames[0].camera if camera is not None else None
+    given = frames[0].camera if source.camera is not None else None
     if (map_camera.width, map_camera.height) != (width, height):
         run.log(f"map made at {map_camera.width}x{map_camera.height}, rescaled to the frames' {width}x{height}")
     return fitted_to_frames(sparse_map, width, height, given), frames
+
+
+def check_unit(mm_per_unit: float | None) -> None:
+    """Raises InputError for millimetres per map unit that cannot be."""
+    if mm_per_unit is not None and not mm_per_unit > 0:
+        raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
 
 
 def made_sparse(
@@ -95,3 +96,19 @@ def fitted_light(run: Run, frames: FrameSequence, sparse_map: SparseMap, model: 
     )
     run.log(f"light {run.record['light_fit']['summary']}")
     return with_light(frames, fit.light) if fit.better else frames
+
+
+def fitted_to_frames(sparse_map: SparseMap, width: int, height: int, camera: CameraModel | None = None) -> SparseMap:
+    """The map with cameras and keypoints at the size of the frames, which a SLAM often halves; `camera` replaces the
+    map's own. Raises InputError when sizes differ by more than a rescaling."""
+
+    def fitted(keyframe: Keyframe) -> Keyframe:
+        own = keyframe.camera
+        sx, sy = width / own.width, height / own.height
+        if abs(sx / sy - 1) > 0.01:
+            check_image_size(f"{sparse_map.source}: keyframe {keyframe.name}", width, height, own)
+        resized = own if (sx, sy) == (1, 1) else own.resized(width, height)
+        return replace(keyframe, camera=camera or resized, pixels=keyframe.pixels * (sx, sy))
+
+    submaps = (replace(s, keyframes=tuple(map(fitted, s.keyframes))) for s in sparse_map.submaps)
+    return replace(sparse_map, submaps=tuple(submaps))

@@ -79,6 +79,10 @@ def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
     import jsonargparse
 
+    from lightdepth.options import add_groups, flags_of, groups_of, with_groups
+
+    jsonargparse.set_parsing_settings(docstring_parse_attribute_docstrings=True)
+
     # The first line only: jsonargparse shows the rest of the docstring beside the options.
     summary = (inspect.getdoc(function) or "").split("\n")[0]
     parser = jsonargparse.ArgumentParser(prog=f"lightdepth {verb}", description=summary, default_env=False)
@@ -101,10 +105,13 @@ def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     if "no_frames" in parameters:
         parser.add_argument("--no_frames", action="store_true", help="leave the pictures out")
     declared: set[str | int] = {name for name in ("output", "overwrite", "no_frames") if name in parameters}
-    parser.add_function_arguments(function, as_positional=True, sub_configs=True, skip=declared)
-    flags = {name for name, parameter in parameters.items() if parameter.annotation in (bool, "bool")} - declared
+    add_groups(parser, function)
+    parser.add_function_arguments(
+        function, as_positional=True, sub_configs=True, skip={*declared, *groups_of(function)}
+    )
+    flags = flags_of(function) - declared
     values = parser.instantiate(parser.parse_args(_spelled_out([_underscored(a) for a in argv], flags)))
-    return {name: values[name] for name in parameters}
+    return with_groups(function, values)
 
 
 def _underscored(argument: str) -> str:

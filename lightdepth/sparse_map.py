@@ -129,6 +129,18 @@ def covisibility(submap: Submap) -> np.ndarray:
     return seen @ seen.T
 
 
+def typical_distance(submap: Submap) -> float:
+    """A typical distance from the keyframes to the points that they observed, in map units: their 35th percentile.
+
+    Wrong points are mostly too far; with 30 % of them this is the median of the right ones.
+    """
+    distances = [np.linalg.norm(k.in_camera(submap.observed_points(k)[1]), axis=1) for k in submap.keyframes]
+    together = np.concatenate(distances)
+    if not len(together):
+        raise InputError(f"map {submap.id}: no keyframe observes any of its points; observations are needed")
+    return float(np.quantile(together, 0.35))
+
+
 def check_rigid(transform: np.ndarray, what: str) -> None:
     """Raises InputError unless (4, 4) is a finite rotation and translation."""
     if transform.shape != (4, 4):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from colons import colon, slam
+from verbs import by_options
 
 from lightdepth.checkpoint import load_model, read_card, save_model
 from lightdepth.datasets import write_folder
@@ -18,8 +19,11 @@ from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
 from train.adapting.module import Adaptation, anchor_loss, let_learn, merge, source_colons, target_loss
 from train.colons import TubeData
-from train.commands.adapt import Judgement, Verdict, adapt, verdict
+from train.commands.adapt import Judgement, Verdict, verdict
+from train.commands.adapt import adapt as adapt_verb
 from train.datamodule import FrameDataModule, collate
+
+adapt = by_options(adapt_verb)
 
 SIZE = (40, 32)
 

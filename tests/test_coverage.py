@@ -11,11 +11,12 @@ import trimesh
 from colons import colon, sequence, slam, truth
 from scenes import cylinder, sphere
 
+from densify.config import DensifyConfig
 from densify.coverage import CoverageConfig, contribution, coverage, find_holes, looked_at, patches, rims, seen_well
 from densify.dense_map import Contribution, DenseMap
 from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
-from densify.pipeline import DensifyConfig, densify
+from densify.pipeline import densify
 from lightdepth.sparse_map import Keyframe, Submap
 from lightdepth.tube import lens
 

@@ -12,8 +12,9 @@ import trimesh
 from colons import colon, sequence, slam, truth
 
 from densify.alignment import Alignment
+from densify.config import DensifyConfig
 from densify.dense_map import GREEN, GREY, RED, DenseMap, Surface, read_dense_map, write_cloud
-from densify.pipeline import DensifyConfig, densify
+from densify.pipeline import densify
 from lightdepth import native
 from lightdepth.calibration import read_camera
 from lightdepth.errors import InputError

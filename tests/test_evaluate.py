@@ -14,17 +14,21 @@ import numpy as np
 import pytest
 import trimesh
 from colons import colon, sequence, slam, truth
+from verbs import by_options
 
-from densify.commands.evaluate import evaluate
+from densify.commands.evaluate import evaluate as evaluate_verb
+from densify.config import DensifyConfig
 from densify.evaluation.judge import Model, dense_models, judge_depth, judge_maps, read_run, read_truth
 from densify.evaluation.suite import alone
 from densify.evaluation.tables import Table, depth_table, long_rows, surface_table, trajectory_table, write_evaluations
-from densify.pipeline import DensifyConfig, densify
+from densify.pipeline import densify
 from lightdepth.datasets import write_folder
 from lightdepth.errors import InputError
 from lightdepth.files.tum import write_tum
 from lightdepth.maps import write_multimap
 from lightdepth.metrics import ALIGNMENTS, NAMES
+
+evaluate = by_options(evaluate_verb)
 
 FRAMES = colon(0).frames
 

@@ -13,10 +13,11 @@ from colons import CAMERA, colon, sequence, slam, truth
 from scenes import PINHOLE, sphere
 from scipy.spatial.transform import Rotation
 
+from densify.config import DensifyConfig
 from densify.dense_map import DenseMapFiles
 from densify.evaluation.errors import evaluate_depth, rms_ate, surface_gap, true_cloud
 from densify.evaluation.judge import dense_models, judge_depth, judge_gap, judge_maps, read_run, read_truth
-from densify.pipeline import DensifyConfig, densify
+from densify.pipeline import densify
 from densify.similarity import Similarity, fit_similarity
 from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError

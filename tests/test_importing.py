@@ -8,11 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from verbs import by_options
 from videos import CAMERA, OCTAGON, picture, uneven_times, write_video
 
 from lightdepth.calibration import write_camera
 from lightdepth.cli import _spelled_out, main
-from lightdepth.commands.import_frames import import_frames
+from lightdepth.commands.import_frames import import_frames as import_frames_verb
 from lightdepth.datasets import FrameSequence, VideoFile, open_sequence, write_folder
 from lightdepth.datasets.sequence import border_mask
 from lightdepth.errors import InputError
@@ -21,6 +22,8 @@ from lightdepth.image_quality import Measures, Meter, one_field
 from lightdepth.importing.overlay import find_overlay
 from lightdepth.importing.selection import BLURRED, FROZEN, KEPT, PASSED, UNREADABLE, Choice, selected
 from lightdepth.models import DeclineModel, predict
+
+import_frames = by_options(import_frames_verb)
 
 COUNT = 72
 TIMES = uneven_times(COUNT, seed=1)

@@ -11,12 +11,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from densify.agreement import AgreementConfig
+from densify.config import DensifyConfig
 from densify.contradiction import ContradictionConfig
 from densify.coverage import coverage
 from densify.fusion.volume import FusionConfig
 from densify.live.densifier import Densifier
 from densify.live.packed import PackedView, Packing
-from densify.pipeline import DensifyConfig, densify_submap
+from densify.pipeline import densify_submap
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.models import DeclineModel

@@ -12,9 +12,11 @@ from colons import EXACT, colon, sequence, truth
 from scipy.spatial.transform import Rotation
 
 from densify.alignment import Alignment
+from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
+from densify.inputs import fitted_to_frames
 from densify.joining import MergeConfig, join_maps, joined_submap, merge, moved_keyframe
-from densify.pipeline import DensifyConfig, SubmapResult, densify, densify_submap, fitted_to_frames
+from densify.pipeline import SubmapResult, densify, densify_submap
 from densify.similarity import Similarity, robust_similarity, umeyama
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError

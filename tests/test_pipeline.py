@@ -12,28 +12,23 @@ from colons import CAMERA, EXACT, colon, sequence, slam, truth
 from scipy.spatial import cKDTree
 
 from densify.agreement import AgreementConfig
+from densify.aligned import split_withheld
 from densify.alignment import Alignment
+from densify.config import DensifyConfig
+from densify.coverage import seen_share
 from densify.dense_map import DenseMap
 from densify.evaluation.errors import closest, true_cloud
+from densify.evaluation.withheld import Withheld
 from densify.fusion.volume import FusionConfig
-from densify.pipeline import (
-    DensifyConfig,
-    SubmapResult,
-    densify,
-    densify_submap,
-    fitted_to_frames,
-    seen_share,
-    split_withheld,
-    typical_distance,
-    withheld_error,
-)
+from densify.inputs import fitted_to_frames
+from densify.pipeline import SubmapResult, densify, densify_submap
 from densify.similarity import fit_similarity
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.models import ConstantModel, DeclineModel
 from lightdepth.observations import observed_distances
-from lightdepth.sparse_map import Keyframe, SparseMap
+from lightdepth.sparse_map import Keyframe, SparseMap, typical_distance
 from lightdepth.tube import lens
 
 FISHEYE = lens("fisheye", 120, 96)
@@ -79,11 +74,11 @@ def test_withheld_points_take_no_part_in_the_alignment():
     keyframe = submap.keyframes[0]
     observed = observed_distances(keyframe, submap, truth(frames[0]))
     config = DensifyConfig(withhold=0.25)
-    used, kept = split_withheld(observed, config, 0, 0)
+    used, kept = split_withheld(observed, 0.25, [0, 0, 0])
     assert len(kept) / len(observed) == pytest.approx(0.25, abs=0.08)
     assert not set(used.point_ids) & set(kept.point_ids) and len(used) + len(kept) == len(observed)
-    again = split_withheld(observed, config, 0, 0)[1]
-    others = [split_withheld(observed, replace(config, seed=1), 0, 0)[1], split_withheld(observed, config, 0, 1)[1]]
+    again = split_withheld(observed, 0.25, [0, 0, 0])[1]
+    others = [split_withheld(observed, 0.25, seed)[1] for seed in ([1, 0, 0], [0, 0, 1])]
     assert np.array_equal(again.point_ids, kept.point_ids)
     assert not any(np.array_equal(o.point_ids, kept.point_ids) for o in others)
     alignment = densify(sequence(frames), found.map, truth, config)[0].dense.alignments[0]
@@ -291,16 +286,16 @@ def test_every_submap_has_its_own_scale_and_every_keyframe_is_shown_once():
     frames = colon(0).frames
     found = slam(frames, maps=2)
     shown = []
-    results = densify(sequence(frames), found.map, truth, DensifyConfig(), shown.append)
+    results = densify(sequence(frames), found.map, truth, DensifyConfig(), lambda *view: shown.append(view))
     for result in results:
         scale = found.map_from_world[result.dense.submap.id][0]
         assert np.median([a.scale for a in result.dense.aligned]) == pytest.approx(scale, rel=0.03)
         steps = {"read", "predict", "align", "agree", "integrate", "extract", "cover", "judge"}
         assert steps == set(result.seconds)
-    assert [(v.submap.id, v.keyframe.number) for v in shown] == [
+    assert [(submap.id, aligned.keyframe.number) for submap, aligned, _ in shown] == [
         (s.id, k.number) for s in found.map.submaps for k in s.keyframes
     ]
-    assert all(v.frame is not None and v.prediction is not None and v.observed is not None for v in shown)
+    assert all(seen.frame and seen.prediction and aligned.observed for _, aligned, seen in shown)
 
 
 def test_the_surface_reaches_no_farther_than_the_points_allow():
@@ -316,13 +311,13 @@ def test_a_point_whose_ray_misses_the_surface_counts_as_infinitely_far():
     result, _ = result_of(frames, DensifyConfig(withhold=0.0), config=EXACT)
     dense, keyframe = result.dense, result.dense.submap.keyframes[0]
     observed = observed_distances(keyframe, dense.submap, truth(frames[0]))
-    whole = withheld_error(dense, [(keyframe, observed)])
+    whole = Withheld.of(dense, [(keyframe, observed)])
     nearest = np.linalg.norm(dense.vertices[dense.triangles].mean(1) - keyframe.center, axis=1)
     cut = replace(dense, triangles=dense.triangles[nearest < np.quantile(observed.mapped, 0.2)])
-    half = withheld_error(cut, [(keyframe, observed)])
+    half = Withheld.of(cut, [(keyframe, observed)])
     assert whole.median < 0.02 and whole.miss < 0.1
     assert half.miss > 0.6 and np.isinf(half.median) and np.isinf(half.p90) and half.median_met < 0.05
-    assert seen_share(cut, [keyframe], sequence(frames)) < 0.5 * seen_share(dense, [keyframe], sequence(frames))
+    assert seen_share(cut, sequence(frames)) < 0.5 * seen_share(dense, sequence(frames))
 
 
 def test_an_empty_surface_is_missed_by_every_point():
@@ -331,9 +326,9 @@ def test_an_empty_surface_is_missed_by_every_point():
     empty = np.zeros((0, 3))
     dense = DenseMap(submap, empty, empty.astype(int), empty, (Alignment("x"),) * 10, 1.0)
     keyframe: Keyframe = submap.keyframes[0]
-    found = withheld_error(dense, [(keyframe, observed_distances(keyframe, submap, truth(frames[0])))])
+    found = Withheld.of(dense, [(keyframe, observed_distances(keyframe, submap, truth(frames[0])))])
     assert found.miss == 1 and np.isinf(found.median_met)
-    assert withheld_error(dense, []) is None
+    assert Withheld.of(dense, []) is None
 
 
 def test_the_voxel_follows_the_map_s_unit():

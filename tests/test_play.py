@@ -11,17 +11,20 @@ import numpy as np
 import pytest
 from colons import colon, sequence, slam
 from test_live import setting
+from verbs import by_options
 
-from densify.commands.live import live
+from densify.commands.live import live as live_verb
+from densify.config import DensifyConfig
 from densify.fusion.volume import FusionConfig
 from densify.live.densifier import STEPS, StepTime
 from densify.live.play import Played, play, time_spent, timings_picture, write_timings
-from densify.pipeline import DensifyConfig
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.frame import Frame
 from lightdepth.models import DeclineModel
 from lightdepth.tube.export import write_synthetic
+
+live = by_options(live_verb)
 
 DECLINE = DeclineModel(details=False)
 COARSE = DensifyConfig(withhold=0.0, fusion=FusionConfig(voxels_per_distance=15.0))

@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 
 from densify.agreement import AgreementConfig
+from densify.config import DensifyConfig
 from densify.evaluation.errors import evaluate_depth
 from densify.evaluation.judge import judge_gap, read_run
-from densify.pipeline import DensifyConfig, SubmapResult, densify, fitted_to_frames
+from densify.inputs import fitted_to_frames
+from densify.pipeline import SubmapResult, densify
 from lightdepth.datasets import FrameSequence, open_sequence, read_c3vd
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from colons import colon, sequence, slam, truth
 
+from densify.config import DensifyConfig
 from densify.evaluation.page import Gallery, densify_page
-from densify.pipeline import DensifyConfig, densify
+from densify.pipeline import densify
 from lightdepth.models import ConstantModel
 from lightdepth.reporting.figures import png
 from lightdepth.reporting.report import Report, number

@@ -11,14 +11,17 @@ import numpy as np
 import pytest
 import yaml
 from colons import colon, slam
+from verbs import by_options
 
-from densify.commands.evaluate import evaluate
+from densify.commands.evaluate import evaluate as evaluate_verb
 from densify.evaluation.suite import present, read_suite
 from lightdepth.datasets import write_c3vd
 from lightdepth.datasets.c3vd import C3VD
 from lightdepth.datasets.splits import read_split
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.maps import write_multimap
+
+evaluate = by_options(evaluate_verb)
 
 ROOT = Path(__file__).parents[1]
 SUITE = ROOT / "configs" / "bench" / "c3vd.yaml"

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from densify.bench.scenes import Rendered, Scene, Size, render
+from densify.config import DensifyConfig, Recipe
 from densify.dense_map import DenseMap
 from densify.evaluation.errors import compare_depth, rms
 from densify.evaluation.judge import Model, judge_maps
 from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
-from densify.pipeline import DensifyConfig, densify
+from densify.pipeline import densify
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
@@ -27,7 +28,6 @@ from lightdepth.models import DepthModel
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Submap
 
-Recipe = Literal["paper", "full"]
 SPARSE, INLIERS = "sparse map", "sparse inliers"
 SHARES: dict[Size, tuple[float, ...]] = {"small": (0.1, 0.45), "full": (0.0, 0.1, 0.3, 0.45)}
 IMAGE_SIZE: dict[Size, tuple[int, int]] = {"small": (160, 128), "full": (320, 256)}
@@ -99,7 +99,7 @@ def _cell(scene: Predicted, share: float, config: BenchConfig, on_row: Callable[
     inliers: list[Model] = []
     for model, known in scene.predictions.items():
         for recipe in config.recipes:
-            chosen = replace(config.densify, recipe=recipe)
+            chosen = config.densify.under(recipe)
             made = [r.dense for r in densify(rendered.frames, sparse_map, partial(_known, known), chosen)]
             rows[f"{model}, {recipe}"] = _dense_row(made, rendered, known)
             inliers = [_model(m.submap, sparse_inliers=m.submap.points[m.judged_points()[1]]) for m in made]

@@ -11,8 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from densify.agreement import AgreementConfig
-from densify.alignment import AlignmentConfig
 from densify.bench.estimators import (
     NO_LIBRARY,
     EstimatorsConfig,
@@ -25,15 +23,12 @@ from densify.bench.record import notes, read_bench, record, tables
 from densify.bench.scenes import Size, scenes
 from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, Recipe, load_models, predicted, run_scene
-from densify.bending import BendingConfig
-from densify.contradiction import ContradictionConfig
-from densify.fusion.rectify import RectifyConfig
-from densify.fusion.volume import FusionConfig
-from densify.pipeline import DensifyConfig
+from densify.config import DensifyConfig, OfflineConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
+from lightdepth.options import Group
 from lightdepth.reporting.progress import Progress
-from lightdepth.reporting.run import Run, git_revision, plain, run_folder, versions
+from lightdepth.reporting.run import Run, git_revision, plain, recorded, run_folder, versions
 
 
 def bench(argv: list[str]) -> int:
@@ -54,12 +49,7 @@ def run(
     checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT),
     recipes: tuple[Recipe, ...] = ("paper", "full"),
     image_size: tuple[int, int] | None = None,
-    alignment: AlignmentConfig = AlignmentConfig(),
-    agreement: AgreementConfig = AgreementConfig(),
-    bending: BendingConfig = BendingConfig(),
-    contradiction: ContradictionConfig = ContradictionConfig(),
-    rectify: RectifyConfig = RectifyConfig(),
-    fusion: FusionConfig = FusionConfig(),
+    method: Group[OfflineConfig] = OfflineConfig(),
     overwrite: bool = False,
 ) -> None:
     """Synthetic colons made from seeds, judged row by row (bench compare A B, bench estimators: --help of each).
@@ -72,17 +62,17 @@ def run(
         checkpoints: paths, names of bundled ones, or decline (the closed form) or constant
         recipes: full, paper, or both
         image_size: width and height of the keyframes, pixels; left out, that of the size
-        alignment: when a keyframe's scale is found and trusted, for all rows
-        agreement: how the keyframes of a submap are aligned together (full)
-        bending: how depth may bend (full)
-        contradiction: pixels that nearer keyframes contradict (full)
-        rectify: which predicted pixels are fused, and how finely
-        fusion: resolution and reach of the surface
         overwrite: replace a run made before
     """
-    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
-    made = DensifyConfig(
-        alignment, rectify, fusion, withhold=0.0, agreement=agreement, bending=bending, contradiction=contradiction
+    arguments = recorded(
+        method,
+        output=output,
+        size=size,
+        first_seed=first_seed,
+        wrong_shares=wrong_shares,
+        checkpoints=checkpoints,
+        recipes=recipes,
+        image_size=image_size,
     )
     config = BenchConfig(
         size,
@@ -91,7 +81,7 @@ def run(
         checkpoints=checkpoints,
         recipes=recipes,
         image_size=image_size or IMAGE_SIZE[size],
-        densify=made,
+        densify=DensifyConfig(**vars(method), withhold=0.0),
     )
     models = load_models(checkpoints)
     with run_folder(output, "bench", arguments, overwrite) as folder:
@@ -148,7 +138,7 @@ def compare_estimators(
         seed: draws them
         overwrite: replace what an earlier run made there
     """
-    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    arguments = recorded(output=output, shares=shares, points=points, draws=draws, seed=seed)
     config = EstimatorsConfig(shares=shares, points=points, draws=draws, seed=seed)
     with run_folder(output, "bench estimators", arguments, overwrite) as folder:
         with Progress("Estimators", len(config.kinds) * len(points) * len(shares)) as bar:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from densify.config import DensifyConfig
 from densify.densified import Densified
 from densify.evaluation.judge import dense_models, judge_maps, read_run, read_truth
 from densify.evaluation.page import densify_page
 from densify.evaluation.tables import write_evaluations
-from densify.pipeline import DensifyConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import open_sequence
 from lightdepth.maps import read_map
 from lightdepth.reporting.progress import Progress
-from lightdepth.reporting.run import run_folder
+from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import lens as tube_lens
 from lightdepth.tube import render_sequence
 from lightdepth.tube.export import write_synthetic
@@ -44,7 +44,16 @@ def demo(
         withhold: share of each keyframe's observed points kept out of the alignment
         overwrite: replace a run made before
     """
-    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    arguments = recorded(
+        output=output,
+        checkpoint=checkpoint,
+        frames=frames,
+        seed=seed,
+        size=size,
+        lens=lens,
+        spurious=spurious,
+        withhold=withhold,
+    )
     model = load_model(checkpoint, details=False)
     with run_folder(output, "demo", arguments, overwrite) as run:
         with Progress("Rendering", frames) as bar:

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from densify.inputs import made_sparse
-from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
-from lightdepth.reporting.run import run_folder
+from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.reconstruction import SfmConfig
 
 
@@ -37,10 +37,11 @@ def sparse(
         sfm: how frames are mapped
         overwrite: replace a folder made before
     """
-    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    source = SequenceSource(data, format, camera, mask=mask)
+    arguments = recorded(output=output, data=data, format=format, camera=camera, mask=mask, poses=poses, sfm=sfm)
     with run_folder(output, "sparse", arguments, overwrite) as run:
-        run.hash_input("data", data)
-        frames = open_sequence(data, format, camera, None, mask)
+        run.hash_inputs(data=data)
+        frames = source.open()
         made_sparse(run, frames, sfm, None if poses is None else _poses(poses, frames))
 
 

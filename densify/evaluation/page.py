@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from densify.aligned import AlignedKeyframe
 from densify.coverage import seen_well
 from densify.dense_map import DenseMap
 from densify.joining import Merged, joined_name
-from densify.pipeline import KeyframeView, SubmapResult
+from densify.pipeline import SubmapResult
+from densify.predictions import Seen
 from lightdepth.reporting.figures import (
     BAD,
     GOOD,
@@ -24,7 +26,7 @@ from lightdepth.reporting.figures import (
     thumbnail,
 )
 from lightdepth.reporting.report import Report, number
-from lightdepth.sparse_map import SparseMap
+from lightdepth.sparse_map import SparseMap, Submap
 
 SEEN_WELL, SEEN_WEAKLY = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15)
 
@@ -40,26 +42,26 @@ class Gallery:
         }
         self.pictures: dict[int, list[tuple[bytes, str]]] = {s.id: [] for s in sparse_map.submaps}
 
-    def __call__(self, view: KeyframeView) -> None:
-        if (view.submap.id, view.keyframe.number) not in self._chosen or view.frame is None or view.prediction is None:
+    def __call__(self, submap: Submap, aligned: AlignedKeyframe, seen: Seen) -> None:
+        if (submap.id, aligned.keyframe.number) not in self._chosen or seen.frame is None or seen.prediction is None:
             return
-        assert view.observed is not None
-        a = view.alignment
-        good, bad = (np.isin(view.observed.point_ids, ids) for ids in (a.inlier_ids, a.outlier_ids))
-        if not view.frame.valid.any():
+        assert aligned.observed is not None
+        a = aligned.alignment
+        good, bad = (np.isin(aligned.observed.point_ids, ids) for ids in (a.inlier_ids, a.outlier_ids))
+        if not seen.frame.valid.any():
             return
-        rows, columns = (np.flatnonzero(view.frame.valid.any(axis)) for axis in (1, 0))
+        rows, columns = (np.flatnonzero(seen.frame.valid.any(axis)) for axis in (1, 0))
         part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        image, corner = view.frame.image[part], np.array([columns[0], rows[0]])
-        depth = thumbnail(colored_distance(view.prediction.distance[part], view.prediction.valid[part]), 480)
-        pixels = view.observed.pixels - corner
+        image, corner = seen.frame.image[part], np.array([columns[0], rows[0]])
+        depth = thumbnail(colored_distance(seen.prediction.distance[part], seen.prediction.valid[part]), 480)
+        pixels = aligned.observed.pixels - corner
         points = marked_points(image, [(pixels[bad], BAD), (pixels[good], GOOD)])
         picture = side_by_side([thumbnail(image, 480), depth, points])
         state = f"scale {number(a.scale)}, {len(a.inlier_ids)} of {a.points} points inliers" if a.ok else a.reason
         caption = (
-            f"{view.keyframe.name}: image, predicted distance (yellow near), map points (green in, red out); {state}"
+            f"{aligned.keyframe.name}: image, predicted distance (yellow near), map points (green in, red out); {state}"
         )
-        self.pictures[view.submap.id].append((png(picture), caption))
+        self.pictures[submap.id].append((png(picture), caption))
 
 
 def densify_page(

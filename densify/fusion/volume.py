@@ -20,6 +20,7 @@ from densify.fusion.marching_cubes import BLOCK, CORNERS, REACH, Cut, cut, one_v
 from densify.fusion.rectify import FULL, SurfaceView
 from densify.fusion.second_core import halves
 from lightdepth.errors import InputError
+from lightdepth.sparse_map import Submap, typical_distance
 
 STEPS = 2048
 """Steps of s / tau on either side of 0; a sum holds 4096 views of full weight."""
@@ -36,6 +37,10 @@ class FusionConfig:
     truncation: float = 6.0  # voxels
     min_views: int = 1  # a surface voxel must be seen by at least this many views
     far: float = 2.0  # predictions beyond far times the 90th percentile of a keyframe's inlier distances are left out
+
+    def voxel_for(self, submap: Submap) -> float:
+        """The size of a voxel, in map units."""
+        return self.voxel or typical_distance(submap) / self.voxels_per_distance
 
 
 @dataclass(frozen=True)

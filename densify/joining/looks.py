@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -29,11 +28,10 @@ def descriptors(side: Side, per_point: int = 3, window: float = 0.05) -> tuple[n
         own = side.submap.rows_of(ids)[0]
         wanted = seen[own] < per_point
         try:
-            frame = side.frames.by_number(keyframe.number)
-            frame = None if frame is None else replace(frame, camera=keyframe.camera)
-        except InputError:  # unreadable, or of another size: its reason is in keyframes.csv
+            frame = side.frames.of_keyframe(keyframe)
+        except InputError:  # missing, unreadable, or of another size: its reason is in keyframes.csv
             continue
-        if frame is None or not wanted.any():
+        if not wanted.any():
             continue
         own, points, pixels = own[wanted], points[wanted], pixels[wanted]
         grey = cv2.cvtColor((frame.image * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from densify.config import DensifyConfig
 from densify.joining.join import Join, MergeConfig
 from densify.joining.meeting import Meeting, join_maps
 from densify.joining.submap import joined_submap
-from densify.pipeline import DensifyConfig, KeyframeView, Model, SubmapResult, densify
+from densify.pipeline import OnKeyframe, SubmapResult, densify
+from densify.predictions import Predictor
 from densify.similarity import Similarity
 from lightdepth.datasets import FrameSequence
 from lightdepth.sparse_map import SparseMap
@@ -56,10 +58,10 @@ def _numbers(s: Similarity, unit: float) -> dict[str, Any]:
 def merge(
     results: Sequence[SubmapResult],
     frames: FrameSequence,
-    model: Model,
+    model: Predictor,
     recipe: DensifyConfig,
     config: MergeConfig,
-    on_keyframe: Callable[[KeyframeView], None] | None = None,
+    on_keyframe: OnKeyframe | None = None,
 ) -> Merged:
     """Joins the submaps of a run, and makes each group of several dense as one."""
     rng = np.random.default_rng([recipe.seed, 2])

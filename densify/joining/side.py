@@ -12,9 +12,8 @@ from densify.dense_map import DenseMap
 from densify.joining.join import MergeConfig
 from densify.joining.looks import descriptors
 from densify.joining.shape import Shape, shape_of
-from densify.pipeline import typical_distance
 from lightdepth.datasets import FrameSequence
-from lightdepth.sparse_map import Keyframe, Submap
+from lightdepth.sparse_map import Keyframe, Submap, typical_distance
 
 
 @dataclass(frozen=True, eq=False)

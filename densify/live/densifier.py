@@ -18,31 +18,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from densify.agreement import View, agree
-from densify.alignment import Alignment, align, bent
-from densify.coverage import contribution, looked_at
+from densify.aligned import align_alone, align_together
+from densify.alignment import Alignment
+from densify.config import LiveConfig, MethodConfig
+from densify.coverage import contribution, with_contributions
 from densify.dense_map import Contribution, DenseMap
+from densify.fusers import view_to_fuse
 from densify.fusion.marching_cubes import unpacked
 from densify.fusion.patches import BlockSurface, Patch, joined
-from densify.fusion.rectify import SurfaceView, surface_view
-from densify.fusion.volume import FusionConfig, TsdfVolume
+from densify.fusion.rectify import SurfaceView
+from densify.fusion.volume import TsdfVolume
 from densify.live.packed import PackedView, Packing
-from densify.pipeline import DensifyConfig, Model, split_withheld, typical_distance
+from densify.predictions import Predictor, Seen
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.images import unit_range
 from lightdepth.frame import Frame
-from lightdepth.observations import observed_distances
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Keyframe, Submap
 
 STEPS = ("predict", "align", "integrate", "extract")
 """What a keyframe's time goes into, the paper's own split."""
-
-LIVE_FUSION = FusionConfig(voxels_per_distance=35.0)
-"""Two thirds as fine as densify's, for two thirds of the time. On six colons the surface's median error is 4 % smaller,
-its RMS 1.5 % smaller, and what lies between truth and surface 2.4 % larger than at 52 voxels."""
 
 _NEW_VOXEL = 1.25  # a map whose typical distance has changed by more, in its units, is given another voxel size
 
@@ -87,23 +84,19 @@ class _Kept:
 class Densifier:
     """One submap's surface, which grows with every keyframe. Not safe to be used by several threads at once.
 
-    `model` predicts a frame's distance; without a `config`, voxels are those of LIVE_FUSION; `light` and `mask` (H, W)
+    `model` predicts a frame's distance; `light` and `mask` (H, W)
     belong to images that are given as arrays.
     """
 
     def __init__(
         self,
-        model: Model,
-        config: DensifyConfig | None = None,
+        model: Predictor,
+        config: MethodConfig = LiveConfig(),
         id: int = 0,
         light: PhotometricCalibration | None = None,
         mask: np.ndarray | None = None,
     ):
-        self.config = config or DensifyConfig(fusion=LIVE_FUSION, withhold=0.0)
-        if self.config.recipe != "full":
-            raise InputError(
-                f"recipe {self.config.recipe!r}; live there is only full: nothing leaves the paper's volume"
-            )
+        self.config = config
         self.id = id
         self.times: dict[str, StepTime] = {}
         self._model = model
@@ -157,7 +150,7 @@ class Densifier:
         with self._timed("integrate"):
             prediction = packing.round(prediction)
         with self._timed("align"):
-            alignment = self._aligned(keyframe, points, prediction)
+            alignment = self._aligned(keyframe, points, Seen(frame, prediction))
         with self._timed("integrate"):
             self._add(_Kept(keyframe, points, packing.done(), alignment), prediction)
         return alignment
@@ -238,11 +231,8 @@ class Densifier:
         ids, first = np.unique(ids, return_index=True)
         submap = Submap(self.id, keyframes, ids, points[first])
         volume = TsdfVolume(1.0, self.config.fusion) if self._volume is None else self._volume
-        mesh = volume.extract_mesh()
-        surface = (mesh.vertices, mesh.triangles, mesh.colors)
-        dense = DenseMap(submap, *surface, self.alignments, volume.voxel, weights=mesh.weights, views=mesh.views)
-        given = {k.keyframe.name: looked_at(dense, k.keyframe, k.given) for k in self._kept.values() if k.given}
-        return replace(dense, contributions=given)
+        given = {k.keyframe.name: k.given for k in self._kept.values() if k.given}
+        return with_contributions(DenseMap.of(volume, submap, self.alignments), given)
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:
@@ -257,18 +247,14 @@ class Densifier:
         pixels = unit_range(image) if image.dtype == np.uint8 else image.astype(np.float32, copy=False)
         return Frame(keyframe.name, pixels, keyframe.camera, self._light, self._mask)
 
-    def _aligned(self, keyframe: Keyframe, points: np.ndarray, prediction: DepthPrediction) -> Alignment:
+    def _aligned(self, keyframe: Keyframe, points: np.ndarray, seen: Seen) -> Alignment:
         if not len(points):
             return Alignment(keyframe.name, reason="it observed no points of the map")
         ids, first = np.unique(keyframe.point_ids, return_index=True)
-        observed = observed_distances(keyframe, Submap(self.id, (keyframe,), ids, points[first]), prediction)
-        used, _ = split_withheld(observed, self.config, self.id, keyframe.number)
-        alignment = align(keyframe.name, used, self.config.alignment)
-        if not alignment.ok or not self.config.agreement.on:
-            return alignment
-        view = View.of(keyframe, used, prediction, alignment.scale)
-        (bend,) = agree([view], np.zeros((1, 1), int), self.config.agreement, self.config.bending)
-        return bent(alignment, bend, used, self.config.alignment)
+        submap = Submap(self.id, (keyframe,), ids, points[first])
+        alone = align_alone(keyframe, submap, seen, self.config.alignment)
+        (bent,) = align_together([alone], np.zeros((1, 1), int), self.config)
+        return bent.alignment
 
     def _moved(self, kept: _Kept, pose: np.ndarray | None, where: _Positions) -> _Kept:
         """The keyframe at another pose and with its points where they are now; itself where nothing has changed."""
@@ -282,7 +268,9 @@ class Densifier:
             return kept
         if not known:
             return replace(kept, keyframe=keyframe, points=points)
-        return _Kept(keyframe, points, kept.view, self._aligned(keyframe, points, kept.view.prediction()))
+        return _Kept(
+            keyframe, points, kept.view, self._aligned(keyframe, points, Seen(prediction=kept.view.prediction()))
+        )
 
     def _replace(self, renewed: dict[str, _Kept]) -> int:
         """Puts keyframes in the place of those of the same name; how many had to be fused anew."""
@@ -304,8 +292,7 @@ class Densifier:
         return len(pairs)
 
     def _view(self, kept: _Kept, prediction: DepthPrediction) -> SurfaceView:
-        reach = self.config.fusion.far * kept.alignment.range_90
-        return surface_view(kept.alignment.applied(prediction), kept.view.image(), self.config.rectify, reach)
+        return view_to_fuse(kept.alignment, prediction, kept.view.image(), self.config)
 
     def _add(self, kept: _Kept, prediction: DepthPrediction | None = None, view: SurfaceView | None = None) -> None:
         """Keeps a keyframe, in the place of one of the same name, and fuses it if it is aligned. Its prediction and its
@@ -336,7 +323,7 @@ class Densifier:
             return self.config.fusion.voxel or 1.0
         ids, rows = np.unique(first.keyframe.point_ids, return_index=True)
         submap = Submap(self.id, (first.keyframe,), ids, first.points[rows])
-        return typical_distance(submap) / self.config.fusion.voxels_per_distance
+        return self.config.fusion.voxel_for(submap)
 
 
 def _fused_alike(one: _Kept, other: _Kept) -> bool:

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from densify.config import MethodConfig
 from densify.dense_map import DenseMap
 from densify.live.densifier import STEPS, Densifier, StepTime
-from densify.pipeline import DensifyConfig, Model, frame_of
+from densify.predictions import Predictor
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.reporting.figures import chart, chart_png
@@ -51,8 +52,8 @@ class Played:
 def play(
     frames: FrameSequence,
     sparse_map: SparseMap,
-    model: Model,
-    config: DensifyConfig,
+    model: Predictor,
+    config: MethodConfig,
     on_map: Callable[[DenseMap], None],
     rate: float | None = None,
     on_keyframe: Callable[[Played], None] | None = None,
@@ -87,7 +88,11 @@ def _play_one(
     densifier: Densifier, submap: Submap, keyframe: Keyframe, frames: FrameSequence, arrival: float, start: float
 ) -> Played:
     wall, cpu = time.perf_counter(), time.process_time()
-    frame, reason = frame_of(keyframe, frames)
+    frame, reason = None, ""
+    try:
+        frame = frames.of_keyframe(keyframe)
+    except InputError as error:
+        reason = str(error)
     densifier.times = {"read": StepTime(time.perf_counter() - wall, time.process_time() - cpu)}
     if frame is not None:
         rows, there = submap.rows_of(keyframe.point_ids)

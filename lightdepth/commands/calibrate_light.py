@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lightdepth.calibration import write_light
-from lightdepth.datasets import open_sequence
+from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
@@ -45,12 +45,13 @@ def calibrate_light(
     if made and not overwrite:
         raise InputError(f"{made[0]}: already there; choose another -o, or give --overwrite")
     rng = np.random.default_rng(seed)
+    source = SequenceSource(data, format, camera, mask=mask)
     if map is None:
-        fit = fit_on_truth(open_sequence(data, format, camera, None, mask), rng)
+        fit = fit_on_truth(source.open(), rng)
         what = f"{data}, frames with known depth"
     else:
         sparse_map = read_map(map)
-        frames = open_sequence(data, format, camera, None, mask, sparse_map.submaps[0].keyframes[0].camera)
+        frames = source.open(sparse_map.submaps[0].keyframes[0].camera)
         fit = fit_on_map(frames, sparse_map, camera=frames[0].camera if camera is not None else None, rng=rng)
         what = f"{data}, {sparse_map.source}"
     output.parent.mkdir(parents=True, exist_ok=True)

@@ -5,22 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
-from lightdepth.datasets import open_sequence
+from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
+from lightdepth.options import Group
 from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.progress import Progress
-from lightdepth.reporting.run import run_folder
+from lightdepth.reporting.run import recorded, run_folder
 
 
 def predict(
-    data: Path,
+    source: Group[SequenceSource],
     output: Path,
     checkpoint: str = DEFAULT_CHECKPOINT,
-    format: str | None = None,
-    camera: Path | None = None,
-    light: str | None = None,
-    mask: Path | None = None,
     refine: int = 0,
     previews: bool = True,
     overwrite: bool = False,
@@ -28,24 +25,19 @@ def predict(
     """Distance, albedo and normals of every frame of a sequence, as one .npz a frame.
 
     Args:
-        data: folder of frames
         output: folder to make
         checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
-        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
-        camera: calibration file that wins over the folder's
-        light: light.json, photometric XML, or gamma=2.2,mu=0, that wins over the folder's
-        mask: image, white where tissue shows
         refine: steps in which each image's distance is improved by its own light; 0 for none
         previews: also write a PNG with image and distance for every frame
         overwrite: replace a folder made before
     """
-    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
+    arguments = recorded(source, output=output, checkpoint=checkpoint, refine=refine, previews=previews)
     model = load_model(checkpoint)
     if refine:
         model = RefinedModel(model, RefineConfig(steps=refine))
-    frames = open_sequence(data, format, camera, light, mask)
+    frames = source.open()
     with run_folder(output, "predict", arguments, overwrite) as run, Progress("Predicting", len(frames)) as bar:
-        run.hash_input("data", data)
+        run.hash_inputs(data=source.data)
         if previews:
             (run.folder / "previews").mkdir()
         for i in range(len(frames)):
@@ -62,5 +54,5 @@ def predict(
                 (run.folder / "previews" / f"{frame.name}.png").write_bytes(png(picture))
             bar.advance()
         if len(run.record["failures"]) == len(frames):
-            raise InputError(f"{data}: no frame could be read; the first: {run.record['failures'][0]['reason']}")
+            raise InputError(f"{source.data}: no frame could be read; the first: {run.record['failures'][0]['reason']}")
         run.record["checkpoint"] = model.name

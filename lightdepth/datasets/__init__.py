@@ -9,11 +9,13 @@ from lightdepth.datasets.reading import FORMATS, open_sequence
 from lightdepth.datasets.scared import read_scared, write_scared
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.datasets.simcol import read_simcol, write_simcol
+from lightdepth.datasets.source import SequenceSource
 from lightdepth.datasets.video import VideoFile, read_video
 
 __all__ = [
     "FORMATS",
     "FrameSequence",
+    "SequenceSource",
     "VideoFile",
     "open_sequence",
     "read_c3vd",

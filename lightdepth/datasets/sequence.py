@@ -7,7 +7,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
 
@@ -17,6 +17,7 @@ import numpy as np
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, read_image, read_raw
 from lightdepth.frame import Frame, frame_number
+from lightdepth.sparse_map import Keyframe
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
@@ -73,6 +74,14 @@ class FrameSequence(Sequence[Frame]):
     def by_number(self, number: int) -> Frame | None:
         """The frame with this number, or None."""
         return self[self.numbers.index(number)] if number in self.numbers else None
+
+    def of_keyframe(self, keyframe: Keyframe) -> Frame:
+        """The image of a keyframe under the map's own camera, which knows best. Raises InputError where there is none,
+        or it cannot be read."""
+        frame = self.by_number(keyframe.number)
+        if frame is None:
+            raise InputError(f"no frame number {keyframe.number} in {self.source}")
+        return replace(frame, camera=keyframe.camera)
 
 
 @dataclass(frozen=True)

@@ -17,21 +17,24 @@ KEPT, PASSED, BLURRED, FROZEN, UNREADABLE = "kept", "passed over", "blurred", "f
 
 @dataclass(frozen=True)
 class Choice:
-    """Which frames to keep.
-
-    Args:
-        rate: frames per second, by time: of each interval the sharpest; left out, 5 for a video, all of a folder
-        every: every n-th frame instead
-        blur: a frame is blurred whose sharpness is below this share of its neighbourhood's; 0 keeps all
-        max_frames: at most so many, spread evenly
-    """
+    """Which frames to keep."""
 
     rate: float | None = None
+    """frames per second to keep, the sharpest of each interval; left out, 5 for a video, all of a folder"""
     every: int | None = None
+    """number n: keep every n-th frame instead"""
+    start: float = 0.0
+    """seconds from the first frame at which the part to keep begins"""
+    end: float | None = None
+    """seconds from the first frame at which the part to keep ends; left out, the last frame"""
     blur: float = 0.6
+    """share of the neighbours' sharpness below which a frame is left out as blurred; 0 keeps all"""
     max_frames: int | None = None
+    """number of frames to keep at most, spread evenly"""
 
     def __post_init__(self) -> None:
+        if self.end is not None and self.end <= self.start:
+            raise InputError(f"--start {self.start} --end {self.end}; expected an end after the start")
         if self.rate is not None and self.every is not None:
             raise InputError(f"--rate {self.rate} and --every {self.every}; give one of them")
         if self.rate is not None and not self.rate > 0:

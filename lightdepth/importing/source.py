@@ -11,7 +11,7 @@ import numpy as np
 
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel, Pinhole
-from lightdepth.datasets import FrameSequence, VideoFile, open_sequence
+from lightdepth.datasets import FrameSequence, SequenceSource, VideoFile
 from lightdepth.datasets.sequence import list_images, read_mask
 from lightdepth.datasets.video import found_calibration, quick_sample, video_at
 from lightdepth.errors import InputError
@@ -44,16 +44,15 @@ class Source:
         return np.unique(np.linspace(0, len(self) - 1, count).round().astype(int)).tolist()
 
 
-def open_source(
-    path: Path, format: str | None, camera: Path | None, light: str | None, mask: Path | None
-) -> tuple[Source, list[Path]]:
+def open_source(source: SequenceSource) -> tuple[Source, list[Path]]:
     """A video, or any sequence that open_sequence reads, with or without camera; and its files."""
-    video = video_at(path) if format in (None, "video") else None
+    path = source.data
+    video = video_at(path) if source.format in (None, "video") else None
     if video is not None:
-        return _of_video(VideoFile(video), camera, light, mask), [video]
+        return _of_video(VideoFile(video), source.camera, source.light, source.mask), [video]
     if path.is_file():
         raise InputError(f"{path}: expected a video such as .mp4 or .mov, or a folder of frames")
-    frames, missing = _sequence(path, format, camera, light, mask)
+    frames, missing = _sequence(source)
     first = frames[0]
 
     def read(i: int) -> tuple[np.ndarray, float]:
@@ -61,7 +60,7 @@ def open_source(
         time = np.nan if frame.time is None else frame.time
         return np.ascontiguousarray(to_bgr8(frame.image)[..., ::-1]), time
 
-    source = Source(
+    found = Source(
         numbers=frames.numbers,
         read=read,
         width=first.camera.width,
@@ -71,7 +70,7 @@ def open_source(
         mask=first.mask,
         no_camera=missing,
     )
-    return source, sorted(file for file in path.rglob("*") if file.is_file())
+    return found, sorted(file for file in path.rglob("*") if file.is_file())
 
 
 def content_hash(files: list[Path]) -> str:
@@ -108,20 +107,18 @@ def _of_video(video: VideoFile, camera: Path | None, light: str | None, mask: Pa
     )
 
 
-def _sequence(
-    path: Path, format: str | None, camera: Path | None, light: str | None, mask: Path | None
-) -> tuple[FrameSequence, str]:
+def _sequence(source: SequenceSource) -> tuple[FrameSequence, str]:
     """Frames of a folder; where only the camera is missing, with one that stands in, and what was said of it."""
     try:
-        return open_sequence(path, format, camera, light, mask), ""
+        return source.open(), ""
     except InputError as error:
-        images = [] if camera is not None or not path.is_dir() else _images(path)
+        images = [] if source.camera is not None or not source.data.is_dir() else _images(source.data)
         if not images:
             raise
         height, width = read_image(images[0]).shape[:2]
         try:
             stand_in = Pinhole(width, height, width, width, width / 2, height / 2)
-            return open_sequence(path, format, None, light, mask, stand_in), "none was found"
+            return source.open(stand_in), "none was found"
         except InputError:
             raise error from None
 

@@ -59,15 +59,23 @@ class Run:
         self.record["failures"].append({"what": what, "reason": reason})
         self.log(f"failed: {what}: {reason}")
 
-    def hash_input(self, name: str, path: Path | None) -> None:
-        if path is not None:
-            self.record.setdefault("inputs", {})[name] = {"path": str(path), "sha256": input_hash(path)}
+    def hash_inputs(self, **paths: Path | None) -> None:
+        """Notes what files and folders were read, by name; None is one that was not given."""
+        for name, path in paths.items():
+            if path is not None:
+                self.record.setdefault("inputs", {})[name] = {"path": str(path), "sha256": input_hash(path)}
 
     def finish(self) -> None:
         import yaml
 
         (self.folder / "config.yaml").write_text(yaml.safe_dump(self._arguments, sort_keys=False))
         write_run_json(self.folder, self._verb, self._arguments, self._start, self.record)
+
+
+def recorded(*groups: object, **options: object) -> dict[str, object]:
+    """The options of a verb, by name, as run.json and config.yaml hold them: the fields of its groups (dataclasses),
+    then its own."""
+    return {name: value for group in groups for name, value in vars(group).items()} | options
 
 
 @contextmanager

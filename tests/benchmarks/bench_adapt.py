@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from verbs import by_options
 
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import write_folder
@@ -26,7 +27,9 @@ from lightdepth.metrics import DepthErrors
 from lightdepth.tube import lens, tube_frames
 from train.cli import train
 from train.colons import TubeData, tube_config
-from train.commands.adapt import adapt
+from train.commands.adapt import adapt as adapt_verb
+
+adapt = by_options(adapt_verb)
 
 SIZE = (80, 64)
 SOURCE = TubeData(lenses=("pinhole",), mu=(0.0, 0.5), gamma=(2.4, 2.6), reflectance=(0.0, 0.2), family="plain")

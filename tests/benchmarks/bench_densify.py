@@ -23,10 +23,11 @@ from scipy.spatial import cKDTree
 
 from densify.agreement import AgreementConfig
 from densify.bending import BendingConfig
+from densify.config import DensifyConfig
 from densify.contradiction import ContradictionConfig
 from densify.evaluation.errors import true_cloud
 from densify.fusion.rectify import RectifyConfig
-from densify.pipeline import DensifyConfig, SubmapResult, densify
+from densify.pipeline import SubmapResult, densify
 from lightdepth import native
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence

@@ -19,10 +19,11 @@ from scenes import cylinder, slanted_plane, sphere
 from scipy.spatial import cKDTree
 
 from densify import pipeline
+from densify.config import DensifyConfig
 from densify.evaluation.errors import true_cloud
 from densify.fusion.rectify import RectifyConfig, SurfaceView, surface_view
 from densify.fusion.volume import FusionConfig, Mesh, TsdfVolume
-from densify.pipeline import DensifyConfig, densify_submap
+from densify.pipeline import densify_submap
 from densify.similarity import fit_similarity
 from lightdepth import native
 from lightdepth.camera import Pinhole

@@ -19,10 +19,10 @@ from scenes import cylinder
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from densify.config import LIVE_FUSION, DensifyConfig
 from densify.fusion.volume import FusionConfig
-from densify.live.densifier import LIVE_FUSION, STEPS, Densifier
+from densify.live.densifier import STEPS, Densifier
 from densify.live.play import play, time_spent
-from densify.pipeline import DensifyConfig
 from lightdepth.camera import CameraModel
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import FrameSequence

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +20,24 @@ import torch
 
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model, save_model
-from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.light.fit_on_map import LightView, fit_on_map, map_views, with_light, withheld_error
 from lightdepth.maps import read_map
 from lightdepth.maps.checks import check_shared_frames
 from lightdepth.models import DeclineModel, DepthModel, NetworkModel, working_size
+from lightdepth.options import Group
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.prediction import DepthPrediction
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.report import Report, number
-from lightdepth.reporting.run import Run, plain, run_folder, versions
+from lightdepth.reporting.run import Run, plain, recorded, run_folder, versions
 from lightdepth.sparse_map import SparseMap
 
+from ..adapting.config import AdaptConfig
 from ..adapting.map_teacher import MapTeacher
-from ..adapting.module import Adaptation, What, merge, source_colons, target_loss
+from ..adapting.module import Adaptation, merge, source_colons, target_loss
 from ..callbacks import Diagnosis, DiagnosisConfig, Progress
 from ..datamodule import FrameDataModule, held_out_count
 from ..running import card_text, quiet, report_every
@@ -90,70 +92,42 @@ def verdict(before: Judgement, after: Judgement) -> Verdict:
 
 
 def adapt(
-    data: Path,
+    source: Group[SequenceSource],
     output: Path,
     checkpoint: str = DEFAULT_CHECKPOINT,
     more: tuple[Path, ...] = (),
     map: Path | None = None,
-    format: str | None = None,
-    camera: Path | None = None,
-    light: str | None = None,
-    mask: Path | None = None,
     fit_light: bool = True,
-    steps: int = 300,
-    learning_rate: float = 5e-4,
-    batch_size: int = 4,
-    size: tuple[int, int] | None = None,
-    what: What = "all",
-    rank: int = 4,
-    anchor: float = 0.0,
-    replay: int = 0,
-    points: float = 0.0,
-    overlap: float = 0.0,
-    held_out: float = 0.2,
+    config: Group[AdaptConfig] = AdaptConfig(),
     keep_worse: bool = False,
-    seed: int = 0,
     overwrite: bool = False,
 ) -> None:
     """Adapt a checkpoint to another endoscope or organ, from frames without truth.
 
     Args:
-        data: folder of frames, or a video
         output: run folder to make
         checkpoint: a path or the name of a bundled one, to start from
         more: other sequences of the same endoscope to learn from, such as '[A, B]'
         map: sparse map of data; its points find the light where nobody gave it, and judge the result
-        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
-        camera: calibration file; left out, the folder's, else the map's
-        light: light.json, photometric XML, or gamma=2.2,mu=0
-        mask: image, white where tissue shows
         fit_light: where nobody gave the light, fit it on the map and use it if withheld keyframes agree
-        steps: of training
-        learning_rate: the highest of its one cycle
-        batch_size: frames in a step
-        size: width and height that it learns at, pixels; left out, the rows of the checkpoint
-        what: of the network learns: all, decoder, norms (scale and shift of the normalisations) or low_rank
-        rank: of what low_rank adds to every convolution
-        anchor: weight that holds the shape of each distance map to what the checkpoint said before
-        replay: synthetic colons of the kind that the checkpoint learned from, which fill half of each batch
-        points: weight of the map's points as teachers; those that a held-out frame saw only judge
-        overlap: weight of where two keyframes of the map see the same tissue
-        held_out: share of each sequence, at its end, that judges and is never trained on
         keep_worse: write the model even when it got worse
-        seed: of order, augmentation, replayed colons and low-rank additions
         overwrite: replace a run made before
     """
-    arguments = {k: v for k, v in locals().items() if k != "overwrite"}
-    if min(steps, batch_size) < 1 or not learning_rate > 0 or replay < 0:
+    if map is None and config.taught:
         raise InputError(
-            f"--steps {steps}, --batch-size {batch_size}, --learning-rate {learning_rate}, --replay {replay}; "
-            "expected positive numbers, and 0 or more colons"
+            f"--points {config.points}, --overlap {config.overlap} without --map; expected a map that teaches where "
+            "they are above 0"
         )
-    if not (points >= 0 and overlap >= 0) or (map is None and points + overlap > 0):
-        raise InputError(
-            f"--points {points}, --overlap {overlap}{'' if map else ' without --map'}; expected weights of 0 or more, "
-            "and a map that teaches where they are above 0"
-        )
+    arguments = recorded(
+        source,
+        config,
+        output=output,
+        checkpoint=checkpoint,
+        more=more,
+        map=map,
+        fit_light=fit_light,
+        keep_worse=keep_worse,
+    )
     start = load_model(checkpoint, details=False)
     if not isinstance(start, NetworkModel):
         raise InputError(f"--checkpoint {checkpoint}: has no weights to adapt; expected a trained checkpoint")
@@ -161,60 +135,73 @@ def adapt(
     with run_folder(output, "adapt", arguments, overwrite) as run:
         sparse_map = read_map(map) if map is not None else None
         map_camera = sparse_map.submaps[0].keyframes[0].camera if sparse_map is not None else None
-        frames = open_sequence(data, format, camera, light, mask, map_camera)
-        for name, path in (("data", data), ("map", map), ("camera", camera), ("mask", mask)):
-            run.hash_input(name, path)
-        used_light: str | None = light
-        training, held = _parted(frames, held_out)
+        frames = source.open(map_camera)
+        run.hash_inputs(**source.files, map=map)
+        training, held = _parted(frames, config.held_out)
         if sparse_map is not None:
             check_shared_frames(sparse_map, frames)
             write_camera(frames[0].camera, run.folder / "camera.json")
-            camera = run.folder / "camera.json"  # the map's, where the folder has none: for all sequences
-            if light is None and fit_light:
+            # The map's camera, where the folder has none: for all sequences.
+            source = replace(source, camera=run.folder / "camera.json")
+            if source.light is None and fit_light:
                 fitted = _fitted_light(run, training, sparse_map, start)
                 if fitted is not None:
                     frames, training, held = (with_light(part, fitted) for part in (frames, training, held))
-                    used_light = str(run.folder / "light.json")
+                    source = replace(source, light=str(run.folder / "light.json"))
         write_light(frames[0].light, run.folder / "light.json")
-        run.log(f"light of {data}: {_said(frames[0].light)}")
-        size = size or working_size(frames[0].camera, start.rows)
-        sequences = [str(path) for path in (data, *more)]
+        run.log(f"light of {source.data}: {_said(frames[0].light)}")
+        size = config.size or working_size(frames[0].camera, start.rows)
+        sequences = [str(path) for path in (source.data, *more)]
         module_data = FrameDataModule(
             sequences,
-            format=format,
-            camera=None if camera is None else str(camera),
-            light=used_light,
-            mask=None if mask is None else str(mask),
-            held_out=held_out,
-            tube=source_colons(start.card, replay),
-            halves=replay > 0,
+            format=source.format,
+            camera=None if source.camera is None else str(source.camera),
+            light=source.light,
+            mask=None if source.mask is None else str(source.mask),
+            held_out=config.held_out,
+            tube=source_colons(start.card, config.replay),
+            halves=config.replay > 0,
             size=size,
-            batch_size=batch_size,
-            seed=seed,
+            batch_size=config.batch_size,
+            seed=config.seed,
         )
         module_data.setup()
         counts = module_data.counts
-        replayed = replay * module_data.tube.frames
+        replayed = config.replay * module_data.tube.frames
         run.log(
             f"{counts['train'] - replayed} frames to learn from, {counts['val']} held out, {size[0]}x{size[1]}"
-            + (f"; {replayed} frames of {replay} synthetic colons in half of each batch" if replay else "")
+            + (
+                f"; {replayed} frames of {config.replay} synthetic colons in half of each batch"
+                if config.replay
+                else ""
+            )
         )
-        loss = target_loss(start.card, frames[0].light.reflectance > 0, replay > 0)
+        loss = target_loss(start.card, frames[0].light.reflectance > 0, config.replay > 0)
         views = [] if sparse_map is None else _views(run, frames, held, sparse_map)
         teacher = None
-        if sparse_map is not None and points + overlap > 0:
-            teacher = _teacher(run, training, held, sparse_map, views, size, seed)
-        generator = torch.Generator().manual_seed(seed)
-        weights = {"points": points, "overlap": overlap}
+        if sparse_map is not None and config.taught:
+            teacher = _teacher(run, training, held, sparse_map, views, size, config.seed)
+        generator = torch.Generator().manual_seed(config.seed)
+        weights = {"points": config.points, "overlap": config.overlap}
         module = Adaptation(
-            start, loss, learning_rate, size[1], anchor, replay > 0, what, rank, generator, teacher, weights
+            start,
+            loss,
+            config.learning_rate,
+            size[1],
+            config.anchor,
+            config.replay > 0,
+            config.what,
+            config.rank,
+            generator,
+            teacher,
+            weights,
         )
 
         shown = [held[i] for i in sorted({round(k * (len(held) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)})]
         pictures = [[DeclineModel(details=False)(frame), start(frame)] for frame in shown]
         before = _judged(module, module_data, start, views)
         closed = _map_error(views, DeclineModel(details=False))
-        _fit(module, module_data, steps, run)
+        _fit(module, module_data, config.steps, run)
         merge(module.network)
         adapted = NetworkModel(module.network, size[1], output.name, details=False)
         after = _judged(module, module_data, adapted, views)
@@ -224,18 +211,22 @@ def adapt(
 
         written = found.better or keep_worse
         if written:
-            card = _card(start, module, counts, steps, seed, asdict(module_data.tube), after.errors, found)
+            card = _card(
+                start, module, counts, config.steps, config.seed, asdict(module_data.tube), after.errors, found
+            )
             card["trained_on"] += (
                 f" {len(sequences)} sequence(s), {counts['train'] - replayed} frames, {size[0]}x{size[1]}"
             )
             save_model(module.network, run.folder / "model.safetensors", card)
             (run.folder / "model.md").write_text(card_text(card, output.name))
-        page = _page(data, start, module, run, frames[0].light, (before, after), closed, found, written, counts["val"])
+        page = _page(
+            source.data, start, module, run, frames[0].light, (before, after), closed, found, written, counts["val"]
+        )
         page.wide_figures([_picture(frame, row) for frame, row in zip(shown, pictures, strict=True)])
         page.write(run.folder / "report.html")
         run.record.update(
             {
-                "seed": seed,
+                "seed": config.seed,
                 "frames": counts,
                 "light": plain(frames[0].light),
                 "loss": asdict(loss),
@@ -258,8 +249,6 @@ def adapt(
 
 def _parted(frames: FrameSequence, share: float) -> tuple[FrameSequence, FrameSequence]:
     """The frames to learn from, and those at the end that judge, as FrameDataModule parts them."""
-    if not 0 < share < 1:
-        raise InputError(f"--held-out {share}; expected a share above 0 and below 1")
     first = len(frames) - held_out_count(len(frames), share)
     if first < 1:
         raise InputError(f"{frames.source}: {len(frames)} frame; expected at least two, one of them to judge by")

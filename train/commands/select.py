@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.maps import read_map
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
@@ -78,7 +78,7 @@ def select(
     paths = _paths(output, no_frames, overwrite)
     sparse_map = read_map(map) if map is not None else None
     map_camera = sparse_map.submaps[0].keyframes[0].camera if sparse_map is not None else None
-    frames = open_sequence(data, format, camera, None, mask, map_camera)
+    frames = SequenceSource(data, format, camera, mask=mask).open(map_camera)
     settings: dict[str, object]
     if sparse_map is not None and map is not None:
         verdicts, how = _by_map(frames, sparse_map, map, map_rules)

@@ -1,0 +1,82 @@
+"""Aligned keyframes into one surface, by either recipe; what each of them contributed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from densify.aligned import AlignedKeyframe
+from densify.alignment import Alignment
+from densify.config import DensifyConfig, MethodConfig
+from densify.contradiction import without
+from densify.coverage import contribution, with_contributions
+from densify.dense_map import Contribution, DenseMap
+from densify.fusion.plain import PlainTsdf, undistorted
+from densify.fusion.rectify import SurfaceView, surface_view
+from densify.fusion.volume import TsdfVolume
+from densify.predictions import Seen
+from lightdepth.prediction import DepthPrediction
+from lightdepth.sparse_map import Submap
+
+
+class Fuser(Protocol):
+    """One surface in the making."""
+
+    def add(self, aligned: AlignedKeyframe, seen: Seen) -> None:
+        """Fuses a keyframe whose alignment is ok, but for its contradicted pixels."""
+
+    def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
+        """The surface as it is now."""
+
+
+def fuser_for(submap: Submap, config: DensifyConfig) -> Fuser:
+    """An empty surface of the recipe, with voxels that suit the submap."""
+    voxel = config.fusion.voxel_for(submap)
+    return PaperFuser(voxel, config) if config.recipe == "paper" else FullFuser(voxel, config)
+
+
+def view_to_fuse(
+    alignment: Alignment, prediction: DepthPrediction, image: np.ndarray, config: MethodConfig
+) -> SurfaceView:
+    """A keyframe's depth in map units, rectified, as far as the fusion reaches."""
+    reach = config.fusion.far * alignment.range_90
+    return surface_view(alignment.applied(prediction), image, config.rectify, reach)
+
+
+class FullFuser:
+    """Rectified wide-angle views into a weighted volume. `voxel` in map units."""
+
+    def __init__(self, voxel: float, config: DensifyConfig) -> None:
+        self._config, self._volume = config, TsdfVolume(voxel, config.fusion)
+        self._contributions: dict[str, Contribution] = {}
+
+    def add(self, aligned: AlignedKeyframe, seen: Seen) -> None:
+        assert seen.frame is not None and seen.prediction is not None
+        prediction = seen.prediction
+        if aligned.stays is not None:
+            prediction = replace(prediction, valid=without(prediction.valid, aligned.stays))
+        view = view_to_fuse(aligned.alignment, prediction, seen.frame.image, self._config)
+        self._volume.integrate(view, aligned.keyframe.cam_from_map)
+        self._contributions[aligned.keyframe.name] = contribution(view, prediction)
+
+    def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
+        return with_contributions(DenseMap.of(self._volume, submap, alignments), self._contributions)
+
+
+class PaperFuser:
+    """One undistorted pinhole image per keyframe into Open3D's volume. `voxel` in map units."""
+
+    def __init__(self, voxel: float, config: DensifyConfig) -> None:
+        self._far, self._voxel = config.fusion.far, voxel
+        self._volume = PlainTsdf(voxel, config.fusion.truncation)
+
+    def add(self, aligned: AlignedKeyframe, seen: Seen) -> None:
+        assert seen.frame is not None and seen.prediction is not None
+        alignment = aligned.alignment
+        depth = undistorted(alignment.applied(seen.prediction), seen.frame.image, self._far * alignment.range_90)
+        self._volume.integrate(*depth, aligned.keyframe.cam_from_map)
+
+    def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
+        return DenseMap(submap, *self._volume.extract_mesh(), alignments, self._voxel)

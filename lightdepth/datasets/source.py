@@ -1,0 +1,35 @@
+"""Where a sequence of frames comes from: the options that every verb which reads one has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lightdepth.camera import CameraModel
+from lightdepth.datasets.reading import open_sequence
+from lightdepth.datasets.sequence import FrameSequence
+
+
+@dataclass(frozen=True)
+class SequenceSource:
+    """Frames, and the files that win over what lies beside them."""
+
+    data: Path
+    """folder of frames, or a video"""
+    format: str | None = None
+    """folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if left out"""
+    camera: Path | None = None
+    """calibration file that wins over the folder's; left out, also the map's own camera is taken where there is none"""
+    light: str | None = None
+    """light.json, photometric XML, or gamma=2.2,mu=0, that wins over the folder's"""
+    mask: Path | None = None
+    """image, white where tissue shows, that wins over the folder's"""
+
+    def open(self, map_camera: CameraModel | None = None) -> FrameSequence:
+        """The frames; `map_camera` as for open_sequence. Raises InputError where they cannot be read."""
+        return open_sequence(self.data, self.format, self.camera, self.light, self.mask, map_camera)
+
+    @property
+    def files(self) -> dict[str, Path | None]:
+        """The files and folders that are read, by the name of their option."""
+        return {"data": self.data, "camera": self.camera, "mask": self.mask}

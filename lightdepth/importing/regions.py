@@ -1,0 +1,69 @@
+"""What of the image shows tissue, what shows text, and what is border."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lightdepth.datasets.sequence import border_mask, border_region
+from lightdepth.errors import InputError
+from lightdepth.files.images import unit_range
+from lightdepth.image_quality import eight_bits, one_field
+from lightdepth.importing.overlay import STRETCH, STRETCHES, Overlay, find_overlay
+from lightdepth.importing.source import Source
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Parts of the image, (H, W) bool: tissue is valid, shown is not blacked out."""
+
+    tissue: np.ndarray
+    shown: np.ndarray
+    overlay: Overlay
+    border_found: bool
+
+
+def find_regions(source: Source, find_text: bool, given_text: np.ndarray | None, deinterlace: bool) -> Regions:
+    images = []
+    for i in source.sample(STRETCH * STRETCHES):
+        try:
+            pixels = eight_bits(source.read(i)[0])
+        except InputError:
+            continue  # the scan counts and reports it
+        if pixels.shape[:2] == (source.height, source.width):
+            images.append(one_field(pixels) if deinterlace else pixels)
+    if not images:
+        raise InputError("none of the frames looked at could be read; copy the data again")
+    floats = [unit_range(image) for image in images]
+    mask, region = border_mask(floats), border_region(floats)
+    nothing = np.zeros(mask.shape, bool)
+    overlay = find_overlay(images, region) if find_text else Overlay(nothing, True, [])
+    tissue = mask if source.mask is None else source.mask
+    if tissue.shape != mask.shape:
+        raise InputError(
+            f"the mask is {tissue.shape[1]}x{tissue.shape[0]}, the images {source.width}x{source.height}; expected the "
+            "same size"
+        )
+    text = overlay.mask if given_text is None else overlay.mask | given_text
+    shown = cv2.dilate((region | tissue).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return Regions(tissue & ~text, shown & ~text, replace(overlay, mask=text), source.mask is None and not mask.all())
+
+
+def read_overlay_mask(path: Path, source: Source) -> np.ndarray:
+    """(H, W) bool of a file that is white where text is. Unlike a mask's, its polarity is not guessed."""
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if grey is None:
+        raise InputError(f"{path}: not a readable image; expected one that is white where text is")
+    if grey.shape != (source.height, source.width):
+        size = f"{source.width}x{source.height}"
+        raise InputError(f"{path}: {grey.shape[1]}x{grey.shape[0]}; expected {size}, as the images are")
+    return grey > 127
+
+
+def tissue_picture(regions: Regions) -> np.ndarray:
+    height, width = regions.tissue.shape
+    size = (min(480, width), max(1, round(height * min(480, width) / width)))
+    return cv2.resize(regions.tissue.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
