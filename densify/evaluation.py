@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.dense_map import DenseMapFiles, Surface
+from densify.similarity import Similarity
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.geometry import depth_from_distance
@@ -24,50 +25,6 @@ from lightdepth.prediction import DepthPrediction
 
 CUBE_MM = 0.2
 """The true cloud keeps one point in each cube of this size."""
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """x -> scale · rotation x + translation."""
-
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def __matmul__(self, first: Similarity) -> Similarity:
-        """self after first."""
-        moved = self.apply(first.translation[None])[0]
-        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, moved)
-
-    def inverse(self) -> Similarity:
-        back = self.rotation.T / self.scale
-        return Similarity(1 / self.scale, self.rotation.T, -back @ self.translation)
-
-    @classmethod
-    def identity(cls) -> Similarity:
-        return cls(1.0, np.eye(3), np.zeros(3))
-
-
-def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> Similarity:
-    """The Sim(3), or SE(3), with the least squared error from source to target points (n, 3) (Umeyama 1991).
-
-    Raises InputError when the points cannot fix it: fewer than three, or all on a line.
-    """
-    if len(source) < 3:
-        raise InputError(f"{len(source)} common poses; a similarity needs at least 3")
-    s, t = source - source.mean(0), target - target.mean(0)
-    for name, points in (("map", s), ("true", t)):
-        spread = np.linalg.svd(points, compute_uv=False)
-        if spread[1] < 1e-3 * max(spread[0], 1e-300):
-            raise InputError(f"the {name} camera centres lie on a line (or in one place): the rotation cannot be found")
-    u, d, vt = np.linalg.svd(t.T @ s / len(s))
-    sign = np.array([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = (u * sign) @ vt
-    scale = float((d * sign).sum() / (s**2).sum() * len(s)) if with_scale else 1.0
-    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
 
 def ate(source: np.ndarray, target: np.ndarray, similarity: Similarity) -> np.ndarray:

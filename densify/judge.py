@@ -16,7 +16,6 @@ import numpy as np
 from densify.dense_map import DenseMapFiles, Surface, map_folders, read_dense_map, run_record
 from densify.evaluation import (
     CUBE_MM,
-    Similarity,
     SurfaceErrors,
     TrueSurface,
     compare_depth,
@@ -27,6 +26,7 @@ from densify.evaluation import (
     true_cloud,
     true_depth,
 )
+from densify.similarity import Similarity
 from densify.trajectory import (
     AlignedTrajectory,
     Trajectory,

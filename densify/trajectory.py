@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from densify.evaluation import Similarity, ate, fit_similarity, rms, sideways_agreement
+from densify.evaluation import ate, rms, sideways_agreement
+from densify.similarity import Similarity, fit_similarity
 from lightdepth.datasets.folder import read_tum
 from lightdepth.errors import InputError
 from lightdepth.frame import frame_number

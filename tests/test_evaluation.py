@@ -14,16 +14,10 @@ from scenes import PINHOLE, sphere
 from scipy.spatial.transform import Rotation
 
 from densify.dense_map import DenseMapFiles
-from densify.evaluation import (
-    Similarity,
-    evaluate_depth,
-    fit_similarity,
-    rms_ate,
-    surface_gap,
-    true_cloud,
-)
+from densify.evaluation import evaluate_depth, rms_ate, surface_gap, true_cloud
 from densify.judge import dense_models, judge_depth, judge_gap, judge_maps, read_run, read_truth
 from densify.pipeline import DensifyConfig, densify
+from densify.similarity import Similarity, fit_similarity
 from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction

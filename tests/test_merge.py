@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from densify.alignment import Alignment
 from densify.dense_map import DenseMap
-from densify.evaluation import Similarity
 from densify.joining import MergeConfig, join_maps, joined_submap, merge, moved_keyframe
 from densify.pipeline import DensifyConfig, SubmapResult, densify, densify_submap, fitted_to_frames
-from densify.similarity import robust_similarity, umeyama
+from densify.similarity import Similarity, robust_similarity, umeyama
 from lightdepth.datasets import FrameSequence, open_sequence
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from densify.agreement import AgreementConfig
 from densify.alignment import Alignment
 from densify.dense_map import DenseMap
-from densify.evaluation import closest, fit_similarity, true_cloud
+from densify.evaluation import closest, true_cloud
 from densify.fusion import FusionConfig
 from densify.pipeline import (
     DensifyConfig,
@@ -27,6 +27,7 @@ from densify.pipeline import (
     typical_distance,
     withheld_error,
 )
+from densify.similarity import fit_similarity
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame

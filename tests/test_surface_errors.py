@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from densify.dense_map import Surface
 from densify.evaluation import (
-    Similarity,
     SurfaceErrors,
     TrueSurface,
     closest,
@@ -24,6 +23,7 @@ from densify.evaluation import (
     true_cloud,
 )
 from densify.judge import Model, Truth, judge_maps, read_mesh, read_truth
+from densify.similarity import Similarity
 from densify.trajectory import in_order
 from lightdepth.errors import InputError
 

@@ -9,7 +9,8 @@ import pytest
 from colons import colon, slam
 from scipy.spatial.transform import Rotation
 
-from densify.evaluation import Similarity, fit_similarity, rms_ate, sideways_agreement
+from densify.evaluation import rms_ate, sideways_agreement
+from densify.similarity import Similarity, fit_similarity
 from densify.trajectory import (
     CLIMB_POSES,
     Trajectory,

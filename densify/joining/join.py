@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from densify.evaluation import Similarity
+from densify.similarity import Similarity
 from lightdepth.errors import InputError
 
 WAYS = ("points", "frames", "looks", "surface")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from densify.evaluation import Similarity
+from densify.similarity import Similarity
 from lightdepth.sparse_map import Keyframe
 
 

@@ -9,10 +9,10 @@ from itertools import combinations
 import numpy as np
 
 from densify.dense_map import DenseMap
-from densify.evaluation import Similarity
 from densify.joining.join import Join, MergeConfig
 from densify.joining.side import Side
 from densify.joining.ways import FINDERS
+from densify.similarity import Similarity
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from densify.evaluation import Similarity
 from densify.joining.join import Join, MergeConfig
 from densify.joining.meeting import Meeting, join_maps
 from densify.joining.submap import joined_submap
 from densify.pipeline import DensifyConfig, KeyframeView, Model, SubmapResult, densify
+from densify.similarity import Similarity
 from lightdepth.datasets import FrameSequence
 from lightdepth.sparse_map import SparseMap
 

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from densify.dense_map import DenseMap
-from densify.evaluation import Similarity
 from densify.joining.join import MergeConfig
+from densify.similarity import Similarity
 from lightdepth import native
 
 

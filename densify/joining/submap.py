@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.evaluation import Similarity
 from densify.joining.join import MergeConfig
 from densify.joining.keyframes import moved_keyframe, same_pixels
+from densify.similarity import Similarity
 from lightdepth.sparse_map import Keyframe, Submap
 
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.evaluation import Similarity
 from densify.joining.join import Agreement, Join
 from densify.joining.keyframes import moved_keyframe
 from densify.joining.side import Side
+from densify.similarity import Similarity
 from lightdepth.camera import CameraModel
 
 

@@ -12,14 +12,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from densify.evaluation import Similarity
 from densify.joining.join import WAYS, Join
 from densify.joining.keyframes import moved_keyframe, same_pixels
 from densify.joining.looks import alike
 from densify.joining.shape import correlation, icp, meeting_points
 from densify.joining.side import Side
 from densify.joining.surfaces import checked, ray_grid
-from densify.similarity import robust_similarity
+from densify.similarity import Similarity, robust_similarity
 
 _CHANCE = 4.5
 """Standard deviations of the correlation of unrelated points, 1 / sqrt(n), that a likeness must exceed: many poses are

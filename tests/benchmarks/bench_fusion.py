@@ -19,10 +19,11 @@ from scenes import cylinder, slanted_plane, sphere
 from scipy.spatial import cKDTree
 
 from densify import pipeline
-from densify.evaluation import fit_similarity, true_cloud
+from densify.evaluation import true_cloud
 from densify.fusion import FusionConfig, Mesh, TsdfVolume
 from densify.pipeline import DensifyConfig, densify_submap
 from densify.rectify import RectifyConfig, SurfaceView, surface_view
+from densify.similarity import fit_similarity
 from lightdepth import native
 from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import load_model

@@ -11,8 +11,9 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from sfm_videos import video
 
-from densify.evaluation import fit_similarity, rms_ate
+from densify.evaluation import rms_ate
 from densify.sfm import SfmConfig, SfmMap, sparse_map_from_frames
+from densify.similarity import fit_similarity
 from densify.unmapped import summary
 from lightdepth.errors import InputError
 from lightdepth.tube import lens
