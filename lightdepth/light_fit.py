@@ -29,7 +29,7 @@ from lightdepth.observations import observed_distances
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness
 from lightdepth.predict import ConstantModel, DeclineModel, working_size
 from lightdepth.prediction import DepthPrediction
-from lightdepth.robust import lmeds_scale
+from lightdepth.robust import TUKEY, lmeds_scale, mad_sigma
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 Model = Callable[[Frame], DepthPrediction]
@@ -39,7 +39,6 @@ GAMMAS, MUS = np.arange(0.6, 4.01, 0.2), np.arange(0.0, 6.01, 0.5)
 GAMMA_RANGE, MU_RANGE = (0.5, 5.0), (0.0, 10.0)
 PRIOR_GAMMA, PRIOR_MU = 0.6, 2.0  # deviations from the defaults that nobody would be surprised at
 POINTS_PER_WITNESS = 50.0  # neighbouring points share texture and slant: so many count as one against the prior
-TUKEY = 4.685
 
 
 @dataclass(frozen=True)
@@ -215,7 +214,7 @@ def fit_samples(
     moments, gram_prior, pull = np.zeros((len(samples), 3, 3)), np.zeros((2, 2)), np.zeros(2)
     for _ in range(30):
         residuals = [r - _shortest_half(r)[1] for r in _residuals(samples, gamma, mu)]
-        sigma = max(1.4826 * float(np.median([np.median(np.abs(r)) for r in residuals])), 1e-6)
+        sigma = mad_sigma(np.array([np.median(np.abs(r)) for r in residuals]), least=1e-6)
         moments = np.stack([_moments(s, r, TUKEY * sigma) for s, r in zip(samples, residuals, strict=True)])
         precision = POINTS_PER_WITNESS * sigma**2 / np.square([PRIOR_GAMMA / 2, PRIOR_MU / 2])
         gram_prior, pull = np.diag(precision), precision * (DEFAULT_GAMMA / 2, DEFAULT_MU / 2)
