@@ -29,7 +29,7 @@ from lightdepth.observations import observed_distances
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness
 from lightdepth.predict import ConstantModel, DeclineModel, working_size
 from lightdepth.prediction import DepthPrediction
-from lightdepth.robust import TUKEY, lmeds_scale, mad_sigma
+from lightdepth.robust import lmeds_scale, mad_sigma, robust_weights
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 Model = Callable[[Frame], DepthPrediction]
@@ -215,7 +215,7 @@ def fit_samples(
     for _ in range(30):
         residuals = [r - _shortest_half(r)[1] for r in _residuals(samples, gamma, mu)]
         sigma = mad_sigma(np.array([np.median(np.abs(r)) for r in residuals]), least=1e-6)
-        moments = np.stack([_moments(s, r, TUKEY * sigma) for s, r in zip(samples, residuals, strict=True)])
+        moments = np.stack([_moments(s, r, sigma) for s, r in zip(samples, residuals, strict=True)])
         precision = POINTS_PER_WITNESS * sigma**2 / np.square([PRIOR_GAMMA / 2, PRIOR_MU / 2])
         gram_prior, pull = np.diag(precision), precision * (DEFAULT_GAMMA / 2, DEFAULT_MU / 2)
         before, (gamma, mu) = (gamma, mu), _solved(moments.sum(0), gram_prior, pull)
@@ -241,9 +241,9 @@ def _shortest_half(values: np.ndarray) -> tuple[float, float]:
     return float(lengths[first]), float(ordered[first] + ordered[first + half]) / 2
 
 
-def _moments(samples: LightSamples, residual: np.ndarray, reach: float) -> np.ndarray:
+def _moments(samples: LightSamples, residual: np.ndarray, sigma: float) -> np.ndarray:
     """(3, 3) weighted second moments of (log a, -log V, -(1 - cos psi)), free of the keyframe's constant."""
-    weight = np.clip(1 - (residual / reach) ** 2, 0, None) ** 2
+    weight = robust_weights(residual / sigma, "tukey")
     table = np.stack([samples.log_distance, -samples.log_v, -samples.off_axis], 1)
     table = table - weight @ table / max(float(weight.sum()), 1e-9)
     return table.T @ (weight[:, None] * table)
