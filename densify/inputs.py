@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,14 +11,12 @@ from densify.pipeline import fitted_to_frames
 from densify.sfm import SfmConfig, sparse_map_from_frames
 from densify.unmapped import summary
 from lightdepth.datasets import FrameSequence, open_sequence
-from lightdepth.errors import InputError
-from lightdepth.light_fit import fit_on_map, with_light
+from lightdepth.light_fit import fit_assumed_light, with_light
 from lightdepth.maps import read_map
 from lightdepth.maps.checks import check_shared_frames
-from lightdepth.photometry import PhotometricCalibration
 from lightdepth.predict import DepthModel
 from lightdepth.report import number
-from lightdepth.run import Run, plain
+from lightdepth.run import Run
 from lightdepth.sparse_map import SparseMap
 
 
@@ -75,23 +72,5 @@ def made_sparse(
 
 def fitted_light(run: Run, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel) -> FrameSequence:
     """The frames under the light that the map tells, where theirs is only assumed and the model does better with it."""
-    if frames[0].light != PhotometricCalibration():
-        return frames
-    start = time.perf_counter()
-    try:
-        fit = fit_on_map(frames, sparse_map, model)
-    except InputError as error:
-        run.log(f"light assumed, not fitted: {error}")
-        return frames
-    run.record["light_fit"] = plain(
-        {
-            "summary": f"fitted on the map: {fit.summary()}",
-            "fitted": fit.fitted,
-            "uncertainty": fit.uncertainty,
-            "errors": fit.errors,
-            "used": fit.better,
-            "seconds": round(time.perf_counter() - start, 3),
-        }
-    )
-    run.log(f"light {run.record['light_fit']['summary']}")
-    return with_light(frames, fit.light) if fit.better else frames
+    light = fit_assumed_light(run, frames, sparse_map, model)
+    return frames if light is None else with_light(frames, light)

@@ -13,6 +13,7 @@ makes it larger. lightdepth.light_truth finds the endoscope's own, from frames w
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,7 @@ from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibrat
 from lightdepth.predict import ConstantModel, DeclineModel, working_size
 from lightdepth.prediction import DepthPrediction
 from lightdepth.robust import lmeds_scale, mad_sigma, robust_weights
+from lightdepth.run import Run, plain
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 Model = Callable[[Frame], DepthPrediction]
@@ -195,6 +197,36 @@ def fit_on_map(
         sum(map(len, samples[::2])),
         _shown(samples[::2], residuals, gamma),
     )
+
+
+def fit_assumed_light(
+    run: Run, frames: FrameSequence, sparse_map: SparseMap, judge: Model
+) -> PhotometricCalibration | None:
+    """The light that the map tells, where the frames' is only assumed and the judge does better with it; else
+    None.
+
+    What was fitted goes into the run's record as `light_fit`, and why nothing was into its log.
+    """
+    if frames[0].light != PhotometricCalibration():
+        return None
+    start = time.perf_counter()
+    try:
+        fit = fit_on_map(frames, sparse_map, judge)
+    except InputError as error:
+        run.log(f"light assumed, not fitted: {error}")
+        return None
+    run.record["light_fit"] = plain(
+        {
+            "summary": f"fitted on the map: {fit.summary()}",
+            "fitted": fit.fitted,
+            "uncertainty": fit.uncertainty,
+            "errors": fit.errors,
+            "used": fit.better,
+            "seconds": round(time.perf_counter() - start, 3),
+        }
+    )
+    run.log(f"light {run.record['light_fit']['summary']}")
+    return fit.light if fit.better else None
 
 
 def fit_samples(
