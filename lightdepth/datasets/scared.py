@@ -34,6 +34,8 @@ from lightdepth.calibration.opencv import read_matrices
 from lightdepth.camera import Brown, CameraModel, camera_from_params
 from lightdepth.camera_conversion import without_k3
 from lightdepth.datasets.checks import AS_GIVEN, INVERSE, READINGS, fitting_reading
+from lightdepth.datasets.folder import image_folder
+from lightdepth.datasets.format import Format
 from lightdepth.datasets.scared_files import IMAGES, VIDEO, StereoVideo, numbered_members
 from lightdepth.datasets.sequence import FrameSequence, along_ray, decode_raw, read_image, read_raw
 from lightdepth.errors import InputError
@@ -82,6 +84,9 @@ def read_scared(
     if (path / VIDEO).is_file():
         return _read_sequence(path, camera, light or PhotometricCalibration(), mask, view)
     return _read_keyframe(path, camera, light or PhotometricCalibration(), mask, view)
+
+
+FORMAT = Format("scared", fits=is_scared, images=image_folder, has_camera=lambda _: True, read=read_scared)
 
 
 def _read_keyframe(
