@@ -30,7 +30,7 @@ from scipy.sparse.linalg import spsolve
 from densify.bending import Bend, BendingConfig
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
-from lightdepth.robust import lower_quartile, robust_weights
+from lightdepth.robust import lower_quartile, mad_sigma, robust_weights
 from lightdepth.sparse_map import Keyframe
 
 _STEP = 1e-3  # of log distance, to differentiate by
@@ -204,7 +204,7 @@ def _inlier_deviation(residual: np.ndarray) -> float:
 
 
 def _deviation(residual: np.ndarray) -> float:
-    return max(1.4826 * float(np.median(np.abs(residual))), _LEAST_SIGMA)
+    return mad_sigma(residual, _LEAST_SIGMA)
 
 
 def _weight(x: np.ndarray) -> np.ndarray:

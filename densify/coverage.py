@@ -78,8 +78,9 @@ class Coverage:
 
 
 def triangle_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    from trimesh.triangles import area  # not at the top: trimesh takes half a second, which live surfaces do not need
+
+    return area(vertices[triangles])
 
 
 def seen_well(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> np.ndarray:
@@ -195,11 +196,11 @@ def rims(triangles: np.ndarray) -> list[np.ndarray]:
 
 
 def _vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, triangles[:, corner], np.cross(b - a, c - a))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    """Unit normals (n, 3), of triangles by their area; 0 where a vertex has no triangle."""
+    from trimesh.geometry import mean_vertex_normals
+    from trimesh.triangles import cross
+
+    return mean_vertex_normals(len(vertices), triangles, cross(vertices[triangles]))
 
 
 def patches(triangles: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:

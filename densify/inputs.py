@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,13 +12,12 @@ from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
-from lightdepth.light.fit_on_map import fit_on_map, with_light
+from lightdepth.light.fit_on_map import fit_assumed_light, with_light
 from lightdepth.maps import read_map
 from lightdepth.maps.checks import check_shared_frames
 from lightdepth.models import DepthModel
-from lightdepth.photometry import PhotometricCalibration
 from lightdepth.reporting.report import number
-from lightdepth.reporting.run import Run, plain
+from lightdepth.reporting.run import Run
 from lightdepth.sfm.reconstruction import SfmConfig, sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
 from lightdepth.sparse_map import Keyframe, SparseMap
@@ -76,26 +74,8 @@ def made_sparse(
 
 def fitted_light(run: Run, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel) -> FrameSequence:
     """The frames under the light that the map tells, where theirs is only assumed and the model does better with it."""
-    if frames[0].light != PhotometricCalibration():
-        return frames
-    start = time.perf_counter()
-    try:
-        fit = fit_on_map(frames, sparse_map, model)
-    except InputError as error:
-        run.log(f"light assumed, not fitted: {error}")
-        return frames
-    run.record["light_fit"] = plain(
-        {
-            "summary": f"fitted on the map: {fit.summary()}",
-            "fitted": fit.fitted,
-            "uncertainty": fit.uncertainty,
-            "errors": fit.errors,
-            "used": fit.better,
-            "seconds": round(time.perf_counter() - start, 3),
-        }
-    )
-    run.log(f"light {run.record['light_fit']['summary']}")
-    return with_light(frames, fit.light) if fit.better else frames
+    light = fit_assumed_light(run, frames, sparse_map, model)
+    return frames if light is None else with_light(frames, light)
 
 
 def fitted_to_frames(sparse_map: SparseMap, width: int, height: int, camera: CameraModel | None = None) -> SparseMap:

@@ -45,19 +45,17 @@ class Wall:
     @cached_property
     def graph(self) -> csr_matrix:
         """Lengths of edges, and of the ways across them between the corners on either side where these run inside."""
-        t = self.triangles
-        edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]]).astype(np.int64)
-        opposite = np.concatenate([t[:, 2], t[:, 0], t[:, 1]])
-        count = len(self.vertices)
-        low, high = edges.min(1), edges.max(1)
-        order = np.argsort(low * count + high, kind="stable")
-        low, high, opposite = low[order], high[order], opposite[order]
-        twins = np.flatnonzero((np.diff(low) == 0) & (np.diff(high) == 0))
-        a, b, c, d = low[twins], high[twins], opposite[twins], opposite[twins + 1]
+        import trimesh
+
+        mesh = trimesh.Trimesh(self.vertices, self.triangles, process=False)
+        low, high = mesh.edges_unique.T
+        a, b = mesh.face_adjacency_edges.T
+        c, d = mesh.face_adjacency_unshared.T  # the corners on either side of the edge a b
         ways, inside = _unfolded(*(self.vertices[i] for i in (a, b, c, d)))
         start, end = np.concatenate([low, c[inside]]), np.concatenate([high, d[inside]])
-        straight = np.linalg.norm(self.vertices[low] - self.vertices[high], axis=1)
-        lengths = np.concatenate([straight, ways[inside]]) + 1e-12 * self.step  # a length of 0 would be no edge
+        lengths = np.concatenate([mesh.edges_unique_length, ways[inside]])
+        lengths += 1e-12 * self.step  # a length of 0 would be no edge
+        count = len(self.vertices)
         key, first = np.unique(np.minimum(start, end) * count + np.maximum(start, end), return_index=True)
         return coo_matrix((lengths[first], (key // count, key % count)), (count, count)).tocsr()
 

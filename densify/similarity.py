@@ -1,4 +1,4 @@
-"""Many similarities at once, and the one that most of a set of correspondences agree with.
+"""Similarities: the one that fits points best, for many sets at once, and the one that most correspondences agree with.
 
 Notation: X_target = s R X_source + t. Points are (n, 3).
 """
@@ -12,11 +12,54 @@ import numpy as np
 from lightdepth.errors import InputError
 
 
+@dataclass(frozen=True)
+class Similarity:
+    """x -> scale · rotation x + translation."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def __matmul__(self, first: Similarity) -> Similarity:
+        """self after first."""
+        moved = self.apply(first.translation[None])[0]
+        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, moved)
+
+    def inverse(self) -> Similarity:
+        back = self.rotation.T / self.scale
+        return Similarity(1 / self.scale, self.rotation.T, -back @ self.translation)
+
+    @classmethod
+    def identity(cls) -> Similarity:
+        return cls(1.0, np.eye(3), np.zeros(3))
+
+
+def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> Similarity:
+    """The Sim(3), or SE(3), with the least squared error from source to target points (n, 3), as `umeyama` finds it.
+
+    Raises InputError when the points cannot fix it: fewer than three, or all on a line.
+    """
+    if len(source) < 3:
+        raise InputError(f"{len(source)} common poses; a similarity needs at least 3")
+    for name, points in (("map", source), ("true", target)):
+        spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
+        if spread[1] < 1e-3 * max(spread[0], 1e-300):
+            raise InputError(f"the {name} camera centres lie on a line (or in one place): the rotation cannot be found")
+    scale, rotation, translation = umeyama(source, target, with_scale=with_scale)
+    return Similarity(float(scale), rotation, translation)
+
+
 def umeyama(
-    source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
+    source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None, with_scale: bool = True
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scales (...), rotations (..., 3, 3) and translations (..., 3) with the least weighted squared error from source
-    to target points (..., n, 3), weights (..., n) (Umeyama 1991). Many at once; degenerate ones give any rotation."""
+    to target points (..., n, 3), weights (..., n) (Umeyama 1991). Without scale, scales are 1.
+
+    Thousands of triples are fitted in one call, which no library of ours does. Degenerate ones give any rotation.
+    """
     w = np.ones(source.shape[:-1]) if weights is None else weights
     w = (w / w.sum(-1, keepdims=True))[..., None]
     mean_s, mean_t = ((w * points).sum(-2, keepdims=True) for points in (source, target))
@@ -25,7 +68,8 @@ def umeyama(
     sign = np.ones(d.shape)
     sign[..., 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     rotation = (u * sign[..., None, :]) @ vt
-    scale = (d * sign).sum(-1) / (w * s**2).sum((-1, -2)).clip(min=1e-300)
+    stretched = (d * sign).sum(-1) / (w * s**2).sum((-1, -2)).clip(min=1e-300)
+    scale = stretched if with_scale else np.ones_like(stretched)
     turned = (rotation @ np.swapaxes(mean_s, -1, -2))[..., 0]
     return scale, rotation, mean_t[..., 0, :] - scale[..., None] * turned
 
@@ -76,47 +120,3 @@ def robust_similarity(
         s, r, t = umeyama(source, target, weights)
         found = Similarity(float(s), r, t)
     return found, np.linalg.norm(found.apply(source) - target, axis=1) <= tolerance
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """x -> scale · rotation x + translation."""
-
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def __matmul__(self, first: Similarity) -> Similarity:
-        """self after first."""
-        moved = self.apply(first.translation[None])[0]
-        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, moved)
-
-    def inverse(self) -> Similarity:
-        back = self.rotation.T / self.scale
-        return Similarity(1 / self.scale, self.rotation.T, -back @ self.translation)
-
-    @classmethod
-    def identity(cls) -> Similarity:
-        return cls(1.0, np.eye(3), np.zeros(3))
-
-
-def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> Similarity:
-    """The Sim(3), or SE(3), with the least squared error from source to target points (n, 3) (Umeyama 1991).
-
-    Raises InputError when the points cannot fix it: fewer than three, or all on a line.
-    """
-    if len(source) < 3:
-        raise InputError(f"{len(source)} common poses; a similarity needs at least 3")
-    s, t = source - source.mean(0), target - target.mean(0)
-    for name, points in (("map", s), ("true", t)):
-        spread = np.linalg.svd(points, compute_uv=False)
-        if spread[1] < 1e-3 * max(spread[0], 1e-300):
-            raise InputError(f"the {name} camera centres lie on a line (or in one place): the rotation cannot be found")
-    u, d, vt = np.linalg.svd(t.T @ s / len(s))
-    sign = np.array([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = (u * sign) @ vt
-    scale = float((d * sign).sum() / (s**2).sum() * len(s)) if with_scale else 1.0
-    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))

@@ -20,7 +20,7 @@ from torchmetrics import Metric
 
 from lightdepth.decline import informative
 from lightdepth.frame import FrameBatch, flipped
-from lightdepth.losses import masked_mean, masked_median
+from lightdepth.losses import masked_median, mean_over_images
 from lightdepth.photometry import brightness, decode, encode
 from lightdepth.robust import lmeds_scale
 
@@ -135,4 +135,4 @@ def inconsistency(model: Callable[[FrameBatch], tuple[Tensor, Tensor]], batch: F
     mirrored = model(flipped(darker, everyone, axis=0))[0].flip(-1)
     difference = mirrored.log() - distance.log()
     usable = informative(darker.image, batch.mask) & (brightness(batch.image) < 1)
-    return masked_mean((difference - masked_median(difference, usable)).abs(), usable)
+    return mean_over_images((difference - masked_median(difference, usable)).abs(), usable)

@@ -22,7 +22,7 @@ from torch import Tensor
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, FrameBatch, to_batch
 from lightdepth.losses import LossConfig, Seen, indirect_light, self_supervised_loss
-from lightdepth.losses.masked import masked_mean
+from lightdepth.losses.masked import mean_over_images
 from lightdepth.models import DepthModel, extended, prediction_of, upsampled, working_size
 from lightdepth.prediction import DepthPrediction
 
@@ -85,7 +85,7 @@ def refine(log_start: Tensor, batch: FrameBatch, config: RefineConfig) -> Tensor
                 indirect = indirect_light(distance, batch.rays, batch.mask, batch.light, config.loss)
             total = self_supervised_loss(distance, None, batch, config.loss, seen, indirect)[0]
             if config.anchor > 0:
-                total = total + config.anchor * masked_mean((log_t - log_start).abs(), batch.mask)
+                total = total + config.anchor * mean_over_images((log_t - log_start).abs(), batch.mask)
             if not torch.isfinite(total):
                 break
             optimizer.zero_grad()

@@ -13,6 +13,7 @@ import numpy as np
 Loss = Literal["geman_mcclure", "huber", "cauchy", "tukey"]
 HUBER, CAUCHY, TUKEY = 1.345, 2.3849, 4.685
 """Of residuals in units of sigma: where each loss is 95 % efficient on Gaussian noise (Zhang 1997, table 1)."""
+_SIGMA_PER_MEDIAN = 1.4826  # of |x|, x normal
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,18 @@ def lmeds_scale(mapped: np.ndarray, predicted: np.ndarray, rng: np.random.Genera
     return best
 
 
+def mad_sigma(residuals: np.ndarray, least: float = 0.0) -> float:
+    """Standard deviation of residuals (n,) around 0, from their median size, so that up to half may be wrong; not below
+    `least`."""
+    return max(_SIGMA_PER_MEDIAN * float(np.median(np.abs(residuals))), least)
+
+
 def inlier_sigma(median: float, n: int, finite_sample: bool = False) -> float:
     """Standard deviation of the inliers, 1.4826 sqrt(min median of squares).
 
     `finite_sample` adds Rousseeuw's factor 1 + 5 / (n - 1), which the densification paper leaves out.
     """
-    return 1.4826 * median * (1 + 5 / (n - 1) if finite_sample else 1.0)
+    return _SIGMA_PER_MEDIAN * median * (1 + 5 / (n - 1) if finite_sample else 1.0)
 
 
 def lower_quartile(values: np.ndarray) -> float:

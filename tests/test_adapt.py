@@ -117,7 +117,10 @@ def test_truth_judges_before_the_map_and_the_map_before_the_loss():
 def test_a_map_finds_the_light_that_nobody_gave_and_its_points_judge(start, sequences, tmp_path):
     record = adapted(start, sequences / "unlit", tmp_path / "run", map=sequences / "slam", keep_worse=True, steps=2)
     assert record["criterion"] == "map" and 0 < record["before"]["map"] < 1 and 0 < record["after"]["map"] < 1
-    assert record["light_fit"]["used"] == (record["light"] != asdict_json(PhotometricCalibration()))
+    fit = record["light_fit"]
+    assert set(fit) == {"summary", "fitted", "uncertainty", "errors", "used", "seconds"}
+    assert fit["summary"].startswith("fitted on the map: gamma") and fit["uncertainty"]["mu"] > 0
+    assert fit["used"] == (record["light"] != asdict_json(PhotometricCalibration()))
     written = json.loads((tmp_path / "run" / "light.json").read_text())
     assert written["gamma"] == pytest.approx(record["light"]["gamma"])
     given = adapted(
@@ -145,7 +148,7 @@ def test_the_light_that_the_map_told_is_what_training_sees(start, sequences, tmp
         return original(self, batch)
 
     found = PhotometricCalibration(gamma=1.3, mu=0.7, source="measured")
-    monkeypatch.setattr("train.commands.adapt._fitted_light", lambda *_: found)
+    monkeypatch.setattr("train.commands.adapt.fit_assumed_light", lambda *_: found)
     monkeypatch.setattr(Adaptation, "batch_loss", spy)
     adapted(start, sequences / "unlit", tmp_path / "run", map=sequences / "slam", keep_worse=True, steps=2)
     assert len(seen) == 2 and np.allclose(seen, 1.3)

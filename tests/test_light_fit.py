@@ -180,6 +180,7 @@ def test_densify_fits_the_light_that_nobody_gave_unless_told_not_to(data, tmp_pa
     assert said is fit_light is ("light_fit" in record)
     if fit_light:
         fit = record["light_fit"]
+        assert set(fit) == {"summary", "fitted", "uncertainty", "errors", "used", "seconds"}
         assert fit["used"] == (fit["errors"]["fitted"] < fit["errors"]["default"]) and fit["seconds"] < 60
         assert "Light fitted on the map" in (tmp_path / "run" / "report.html").read_text()
 

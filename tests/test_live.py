@@ -16,7 +16,7 @@ from densify.contradiction import ContradictionConfig
 from densify.coverage import coverage
 from densify.fusion.volume import FusionConfig
 from densify.live.densifier import Densifier
-from densify.live.packed import PackedView, Packing
+from densify.live.packed import PackedView, Packing, _read, _written
 from densify.pipeline import densify_submap
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
@@ -252,6 +252,16 @@ def test_what_is_kept_of_a_keyframe_is_small_and_comes_back():
     assert view.size < 0.15 * (prediction.distance.nbytes + frame.image.nbytes)
     nothing, back = packed_view(replace(prediction, valid=np.zeros_like(valid)), frame.image)
     assert not back.valid.any() and not nothing.prediction().valid.any()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 1), (48, 64), (0, 5)])
+def test_codes_come_back_as_they_were_however_far_they_jump(shape):
+    rng = np.random.default_rng(0)
+    smooth = (30000 + 200 * np.add.outer(np.arange(shape[0]), np.arange(shape[1]))).astype(np.uint16)
+    jumping = rng.choice(np.array([0, 1, 127, 128, 32767, 32768, 65535], np.uint16), shape)
+    for codes in (smooth, jumping, rng.integers(0, 65536, shape).astype(np.uint16)):
+        back = _read(_written(codes), codes.shape)
+        assert back.dtype == np.uint16 and np.array_equal(back, codes)
 
 
 def test_a_keyframe_without_trust_takes_no_part_until_its_points_are_corrected():

@@ -15,8 +15,8 @@ from lightdepth.losses import (
     facing_loss,
     indirect_light,
     log_error,
-    masked_mean,
     masked_median,
+    mean_over_images,
     photometric_loss,
     render_image,
     rendered_log_brightness,
@@ -230,7 +230,7 @@ def test_masked_median_and_mean_agree_with_torch_on_what_is_inside():
     median = masked_median(values, mask).flatten()
     assert torch.equal(median[:2], torch.stack([values[i][mask[i]].median() for i in range(2)])) and median[2] == 0
     expected = (values[0][mask[0]].mean() + values[1][mask[1]].mean()) / 3
-    assert torch.isclose(masked_mean(values, mask), expected)
+    assert torch.isclose(mean_over_images(values, mask), expected)
 
 
 def test_photometric_is_huber_over_its_width():

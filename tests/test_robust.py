@@ -14,6 +14,7 @@ from lightdepth.robust import (
     inlier_sigma,
     lmeds_scale,
     lower_quartile,
+    mad_sigma,
     median_rank,
     refine_scale,
     robust_weights,
@@ -199,6 +200,15 @@ def test_refinement_of_perfect_points_keeps_the_scale():
 def test_sigma_of_gaussian_residuals_is_their_standard_deviation():
     residuals = np.random.default_rng(0).normal(0, 0.7, 200_000)
     assert inlier_sigma(float(np.median(np.abs(residuals))), len(residuals)) == pytest.approx(0.7, rel=0.01)
+
+
+def test_the_deviation_of_residuals_is_found_where_a_third_of_them_are_wrong_and_not_below_the_least():
+    residuals = np.random.default_rng(1).normal(0, 0.7, 100_000)
+    assert mad_sigma(residuals) == inlier_sigma(float(np.median(np.abs(residuals))), len(residuals))
+    assert mad_sigma(residuals) == pytest.approx(0.7, rel=0.01)
+    residuals[:33_000] = 100
+    assert mad_sigma(residuals) < 2 * 0.7
+    assert mad_sigma(np.zeros(5), least=0.02) == 0.02
 
 
 def test_the_finite_sample_factor_is_rousseeuws_and_off_by_default():

@@ -1,5 +1,7 @@
 """The likely reason for every frame that found no place, and which frames are matched at all."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -73,3 +75,11 @@ def test_frames_without_features_are_like_no_other():
 def test_equal_features_give_equal_pairs():
     descriptors = sights(30, np.arange(30) % 11, np.random.default_rng(2))
     assert frame_pairs(descriptors, 2, 3, 5) == frame_pairs(descriptors, 2, 3, 5)
+
+
+def test_a_sequence_with_fewer_sights_than_words_is_described_without_a_warning():
+    descriptors = [np.repeat(d[:2], 30, axis=0) for d in sights(9, np.arange(9) % 3, np.random.default_rng(3))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        looks = vlad(descriptors, 0)
+    np.testing.assert_allclose(np.linalg.norm(looks, axis=1), 1, rtol=1e-5)

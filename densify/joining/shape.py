@@ -12,6 +12,7 @@ from densify.dense_map import DenseMap
 from densify.joining.join import MergeConfig
 from densify.similarity import Similarity
 from lightdepth import native
+from lightdepth.robust import robust_weights
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def icp(similarity: Similarity, to: Shape, own: Shape) -> Similarity:
             if len(p) < 20:
                 return similarity
             off = ((q - p) * n).sum(1)
-            weight = 1 / (1 + (4 * off / reach) ** 2) ** 2  # Geman and McClure
+            weight = robust_weights(4 * off / reach, "geman_mcclure")
             middle = p.mean(0)
             arms = p - middle
             slopes = np.concatenate([np.cross(arms, n), n, (arms * n).sum(1)[:, None]], 1)

@@ -6,7 +6,7 @@ move keyframes after a loop closure, by taking their depth out of the volume and
 it extracts only the part of the surface that changed.
 
 Memory: the blocks of the volume that a surface passes near (10 kB each), the triangles, and for each keyframe its
-packed depth and image (densify.live.packed, some 140 kB at 320x256) and its points.
+packed depth and image (densify.live.packed, some 120 kB at 320x256) and its points.
 """
 
 from __future__ import annotations

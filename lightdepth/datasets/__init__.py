@@ -6,7 +6,8 @@ from lightdepth.datasets.endoslam import read_endoslam, write_endoslam
 from lightdepth.datasets.folder import read_folder, write_folder
 from lightdepth.datasets.hamlyn import read_hamlyn, write_hamlyn
 from lightdepth.datasets.reading import FORMATS, open_sequence
-from lightdepth.datasets.scared import read_scared, write_scared
+from lightdepth.datasets.scared import read_scared
+from lightdepth.datasets.scared_writing import write_scared
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.datasets.simcol import read_simcol, write_simcol
 from lightdepth.datasets.source import SequenceSource

@@ -23,15 +23,8 @@ import cv2
 import numpy as np
 
 from lightdepth.camera import CameraModel, Scaramuzza
-from lightdepth.datasets.sequence import (
-    FrameSequence,
-    along_ray,
-    check_one_size,
-    found_mask,
-    numbered_files,
-    read_code,
-    warn_of_gaps,
-)
+from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
+from lightdepth.datasets.sequence import FrameSequence, found_mask, numbered_files
 from lightdepth.errors import InputError
 from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.frame import Frame
@@ -69,6 +62,7 @@ C3VD_V2 = Scaramuzza(
 ).with_pixel_center(0.0)
 """The camera of C3VD, second and third edition (as the third's tools have it), at full size."""
 FULL_SCALE_MM = 100.0
+_DEPTH = DepthCode("C3VD", 65535, FULL_SCALE_MM, clipped=65535)
 LIGHT = PhotometricCalibration(gamma=2.2, mu=2.767, source="published")
 
 
@@ -115,9 +109,8 @@ def read_c3vd(
         )
     colour = _colour(path, tree)
     depth = numbered_files(path / tree.depth, r"(\d+)_depth\.tiff")
-    numbers = sorted(colour)
-    check_one_size([colour[n] for n in numbers])
-    warn_of_gaps(path, numbers, depth)
+    images = [colour[n] for n in sorted(colour)]
+    numbers = checked_images(path, images, depth)
     poses = _read_poses(path / "pose.txt") if (path / "pose.txt").is_file() else None
     if poses is not None and numbers[-1] >= len(poses):
         raise InputError(
@@ -125,7 +118,7 @@ def read_c3vd(
             "frame, from frame 0"
         )
     if camera is None:
-        height, width = read_image(colour[numbers[0]]).shape[:2]
+        height, width = read_image(images[0]).shape[:2]
         whole = tree.camera
         if abs(width / height / (whole.width / whole.height) - 1) > 0.01:
             raise InputError(
@@ -134,29 +127,23 @@ def read_c3vd(
             )
         camera = whole.resized(width, height)
     if mask is None:
-        mask = found_mask([colour[n] for n in numbers])
+        mask = found_mask(images)
     ray_z = camera.rays()[0][..., 2]
     names = [f"{n:04d}{tree.suffix.removesuffix('.png')}" for n in numbers]
+    return frames_of(
+        path,
+        images,
+        camera,
+        light or LIGHT,
+        mask,
+        names=names,
+        times=[number / 30.0 for number in numbers],
+        poses=None if poses is None else poses[numbers],
+        distance=lambda i: _DEPTH.distance(depth[numbers[i]], ray_z) if numbers[i] in depth else None,
+    )
 
-    def load(i: int) -> Frame:
-        number = numbers[i]
-        distance = None
-        if number in depth:
-            code = read_code(depth[number], ray_z, "C3VD")
-            known = (code > 0) & (code < 65535)
-            distance = along_ray(code.astype(np.float32) / 65535 * FULL_SCALE_MM, known, ray_z)
-        return Frame(
-            names[i],
-            read_image(colour[number]),
-            camera,
-            light or LIGHT,
-            mask,
-            time=number / 30.0,
-            true_distance=distance,
-            true_world_from_cam=None if poses is None else poses[number],
-        )
 
-    return FrameSequence(names, load, str(path))
+FORMAT = Format("c3vd", fits=is_c3vd, images=image_folder, has_camera=lambda _: True, read=read_c3vd)
 
 
 def write_c3vd(frames: Sequence[Frame], path: Path, tree: str = "v1") -> None:

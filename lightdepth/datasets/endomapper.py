@@ -23,7 +23,8 @@ import numpy as np
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.sequence import FrameSequence, check_one_size, found_mask, list_images, no_images, read_mask
+from lightdepth.datasets.format import Format, checked_images, frames_of
+from lightdepth.datasets.sequence import FrameSequence, found_mask, list_images, no_images, read_mask
 from lightdepth.errors import InputError
 from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.files.schema import read_json
@@ -86,7 +87,7 @@ def read_endomapper(
             f"{images[0]}: number 0, but EndoMapper counts frames from 1 (out1.png is the first of the video); "
             "extract them so, or read them with --format folder"
         )
-    check_one_size(images)
+    numbers = checked_images(path, images)
     height, width = read_image(images[0]).shape[:2]
     if camera is None:
         file = calibration_file(path, GEOMETRY)
@@ -105,13 +106,12 @@ def read_endomapper(
         if mask.shape != (height, width) and abs(mask.shape[1] / mask.shape[0] / (width / height) - 1) < 0.01:
             mask = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     fps = fps or _fps(path)
+    times = None if fps is None else [(number - 1) / fps for number in numbers]
+    return frames_of(source, images, camera, light, mask, times=times)
 
-    def load(i: int) -> Frame:
-        number = frame_number(images[i].name)
-        time = None if fps is None else (number - 1) / fps
-        return Frame(images[i].stem, read_image(images[i]), camera, light, mask, time=time)
 
-    return FrameSequence([image.stem for image in images], load, str(source))
+# A map's camera wins: EndoMapper's own maps were made with other numbers than its calibrations
+FORMAT = Format("endomapper", fits=is_endomapper, images=image_folder, has_camera=lambda _: False, read=read_endomapper)
 
 
 def write_endomapper(frames: Sequence[Frame], path: Path, endoscope: str = "00") -> None:

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole, camera_from_params
+from lightdepth.datasets.format import Format, frames_of
 from lightdepth.datasets.sequence import FrameSequence, found_mask, list_images, numbered_files
 from lightdepth.errors import InputError
 from lightdepth.files.images import read_image, to_bgr8
@@ -85,18 +86,17 @@ def read_endoslam(
     poses = _poses(path)
     if mask is None:
         mask = found_mask(images)
+    of_images = [poses.get(frame_number(image.name)) for image in images]
+    return frames_of(path, images, camera, light or PhotometricCalibration(), mask, poses=of_images)
 
-    def load(i: int) -> Frame:
-        return Frame(
-            images[i].stem,
-            read_image(images[i]),
-            camera,
-            light or PhotometricCalibration(),
-            mask,
-            true_world_from_cam=poses.get(frame_number(images[i].name)),
-        )
 
-    return FrameSequence([image.stem for image in images], load, str(path))
+FORMAT = Format(
+    "endoslam",
+    fits=is_endoslam,
+    images=image_folder,
+    has_camera=lambda path: camera_file(path) is not None,
+    read=read_endoslam,
+)
 
 
 def write_endoslam(frames: Sequence[Frame], path: Path, simulated: bool = False) -> None:

@@ -16,20 +16,24 @@ import numpy as np
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
+from lightdepth.datasets.format import Format, checked_images, frames_of
 from lightdepth.datasets.sequence import (
     FrameSequence,
-    check_one_size,
     legible,
     list_images,
     no_images,
     read_mask,
-    warn_of_gaps,
 )
 from lightdepth.errors import InputError
-from lightdepth.files.images import image_size, read_image, read_raw, to_bgr8
+from lightdepth.files.images import image_size, read_raw, to_bgr8
 from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
+
+
+def image_folder(path: Path) -> Path:
+    """Where the frames of a sequence lie."""
+    return path / "frames" if (path / "frames").is_dir() else path
 
 
 def read_folder(
@@ -39,13 +43,14 @@ def read_folder(
     mask: np.ndarray | None = None,
 ) -> FrameSequence:
     """Frames of a folder. What is given here wins over the files in it; without any camera it is refused."""
-    images = list_images(path / "frames" if (path / "frames").is_dir() else path)
+    images = list_images(image_folder(path))
     if not images:
         raise InputError(f"{path}: {no_images(path)}; expected frames such as 000123.png")
-    check_one_size(images)
+    known = {frame_number(file.name) for file in (path / "truth" / "distance").glob("*.tiff")}
+    checked_images(path, images, known)
     first = legible(images)
     if camera is None:
-        if not (path / "camera.json").is_file():
+        if not _has_camera(path):
             above = path.resolve().parent
             if (above / "camera.json").is_file():
                 raise InputError(f"{path}: no camera.json, but {above} has one; give the sequence's folder, {above}")
@@ -64,25 +69,36 @@ def read_folder(
     times, poses = read_tum(truth / "poses.tum") if (truth / "poses.tum").is_file() else (None, None)
     if poses is not None and len(poses) != len(images):
         raise InputError(f"{truth / 'poses.tum'}: {len(poses)} poses for {len(images)} frames; expected one for each")
-    known = {frame_number(file.name) for file in (truth / "distance").glob("*.tiff")}
-    warn_of_gaps(path, [frame_number(image.name) for image in images], known)
-
     clock = read_times(path / "times.csv") if (path / "times.csv").is_file() else {}
+    of_truth = [None if times is None else float(times[i]) for i in range(len(images))]
 
-    def load(i: int) -> Frame:
-        distance = truth / "distance" / f"{images[i].stem}.tiff"
-        return Frame(
-            images[i].stem,
-            read_image(images[i]),
-            camera,
-            light,
-            mask,
-            time=clock.get(images[i].stem, None if times is None else float(times[i])),
-            true_distance=read_raw(distance).astype(np.float32) if distance.is_file() else None,
-            true_world_from_cam=None if poses is None else poses[i],
-        )
+    def distance(i: int) -> np.ndarray | None:
+        file = truth / "distance" / f"{images[i].stem}.tiff"
+        return read_raw(file).astype(np.float32) if file.is_file() else None
 
-    return FrameSequence([p.stem for p in images], load, str(path))
+    return frames_of(
+        path,
+        images,
+        camera,
+        light,
+        mask,
+        times=[clock.get(image.stem, time) for image, time in zip(images, of_truth, strict=True)],
+        poses=poses,
+        distance=distance,
+    )
+
+
+def _has_camera(path: Path) -> bool:
+    return (path / "camera.json").is_file()
+
+
+FORMAT = Format(
+    "folder",
+    fits=lambda path: bool(list_images(image_folder(path))),
+    images=image_folder,
+    has_camera=_has_camera,
+    read=read_folder,
+)
 
 
 def write_folder(frames: Iterable[Frame], path: Path) -> None:

@@ -20,15 +20,8 @@ import numpy as np
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole
-from lightdepth.datasets.sequence import (
-    FrameSequence,
-    along_ray,
-    check_one_size,
-    found_mask,
-    numbered_files,
-    read_code,
-    warn_of_gaps,
-)
+from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
+from lightdepth.datasets.sequence import FrameSequence, found_mask, numbered_files
 from lightdepth.errors import InputError
 from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.frame import Frame
@@ -43,6 +36,7 @@ class _Tree:
 
 
 _TREES = {"rectified": _Tree("image01", "depth01", True), "tracking": _Tree("color", "depth", False)}
+_CODE = DepthCode("Hamlyn")
 _COLOUR, _DEPTH = r"(\d+)\.(?:jpg|png)", r"(\d+)\.png"
 
 
@@ -55,6 +49,11 @@ def image_folder(path: Path) -> Path:
     """Where the colour images of a sequence lie."""
     tree = _tree(path)
     return path if tree is None else path / tree.colour
+
+
+def camera_file(path: Path) -> Path:
+    """Where the camera of a sequence stands."""
+    return path / "intrinsics.txt"
 
 
 def read_hamlyn(
@@ -71,36 +70,27 @@ def read_hamlyn(
             "sequence of Endo-Depth's Hamlyn set?"
         )
     colour, depth = numbered_files(path / tree.colour, _COLOUR), numbered_files(path / tree.depth, _DEPTH)
-    numbers = sorted(colour)
-    check_one_size([colour[n] for n in numbers])
-    if tree.measured:
-        warn_of_gaps(path, numbers, depth)
+    images = [colour[n] for n in sorted(colour)]
+    numbers = checked_images(path, images, depth if tree.measured else None)
     if camera is None:
-        file = path / "intrinsics.txt"
+        file = camera_file(path)
         if not file.is_file():
             raise InputError(f"{path}: no intrinsics.txt; put the sequence's there, or give --camera FILE")
-        height, width = read_image(colour[numbers[0]]).shape[:2]
+        height, width = read_image(images[0]).shape[:2]
         camera = read_camera(file, (width, height))
     if mask is None:
-        mask = found_mask([colour[n] for n in numbers])
+        mask = found_mask(images)
     ray_z = camera.rays()[0][..., 2]
 
-    def load(i: int) -> Frame:
-        number = numbers[i]
-        distance = None
-        if tree.measured and number in depth:
-            code = read_code(depth[number], ray_z, "Hamlyn")
-            distance = along_ray(code.astype(np.float32), code > 0, ray_z)
-        return Frame(
-            colour[number].stem,
-            read_image(colour[number]),
-            camera,
-            light or PhotometricCalibration(),
-            mask,
-            true_distance=distance,
-        )
+    def distance(i: int) -> np.ndarray | None:
+        return _CODE.distance(depth[numbers[i]], ray_z) if tree.measured and numbers[i] in depth else None
 
-    return FrameSequence([colour[n].stem for n in numbers], load, str(path))
+    return frames_of(path, images, camera, light or PhotometricCalibration(), mask, distance=distance)
+
+
+FORMAT = Format(
+    "hamlyn", fits=is_hamlyn, images=image_folder, has_camera=lambda path: camera_file(path).is_file(), read=read_hamlyn
+)
 
 
 def write_hamlyn(frames: Sequence[Frame], path: Path, tree: str = "rectified") -> None:

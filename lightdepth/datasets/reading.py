@@ -6,31 +6,18 @@ from pathlib import Path
 
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
-from lightdepth.datasets import c3vd, endomapper, endoslam, hamlyn, simcol
-from lightdepth.datasets.c3vd import is_c3vd, read_c3vd
+from lightdepth.datasets import c3vd, endomapper, endoslam, folder, hamlyn, scared, simcol
 from lightdepth.datasets.checks import check_sequence
-from lightdepth.datasets.endomapper import is_endomapper, read_endomapper
-from lightdepth.datasets.endoslam import is_endoslam, read_endoslam
-from lightdepth.datasets.folder import read_folder
-from lightdepth.datasets.hamlyn import is_hamlyn, read_hamlyn
-from lightdepth.datasets.scared import is_scared, read_scared
+from lightdepth.datasets.format import Format
 from lightdepth.datasets.sequence import FrameSequence, legible, list_images, read_mask
-from lightdepth.datasets.simcol import is_simcol, read_simcol
 from lightdepth.datasets.video import VideoFile, read_video, video_at
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, read_image
 from lightdepth.frame import check_image_size
 
-FORMATS = ("folder", "c3vd", "simcol", "hamlyn", "scared", "endoslam", "endomapper", "video")
-
-_LOOKS = {
-    "c3vd": is_c3vd,
-    "simcol": is_simcol,
-    "hamlyn": is_hamlyn,
-    "scared": is_scared,
-    "endoslam": is_endoslam,
-    "endomapper": is_endomapper,
-}
+_DATA_SETS = (c3vd.FORMAT, simcol.FORMAT, hamlyn.FORMAT, scared.FORMAT, endoslam.FORMAT, endomapper.FORMAT)
+_BY_NAME = {data_set.name: data_set for data_set in (folder.FORMAT, *_DATA_SETS)}
+FORMATS = (*_BY_NAME, "video")
 _DEEP, _MANY = 3, 200  # folders within which sequences are looked for, to name them, and entries of each
 
 
@@ -79,41 +66,24 @@ def _open(
         raise InputError(f"{path}: {found}; expected a folder of frames, or a video such as .mp4 or .mov")
     if format == "video":
         raise InputError(f"{path}: no video in it, or images beside it; give the video file itself")
-    if cluster:
-        format = "endomapper"
-    if format is None:
-        format = _looks_like(path) or "folder"
-    if format not in FORMATS:
+    if format is not None and format not in _BY_NAME:
         raise InputError(f"format {format!r}; expected one of {', '.join(FORMATS)}")
+    if cluster:
+        data_set = endomapper.FORMAT
+    elif format is not None:
+        data_set = _BY_NAME[format]
+    else:
+        data_set = _looks_like(path) or folder.FORMAT
+    images = data_set.images(path)
     chosen_light = read_light(light) if light is not None else None
-    first = legible(list_images(_image_folder(path, format)))
+    first = legible(list_images(images))
     chosen_mask = read_mask(Path(mask), first) if mask is not None else None
-    chosen = _read_camera(Path(camera), _image_folder(path, format)) if camera is not None else None
+    chosen = _read_camera(Path(camera), images) if camera is not None else None
     if chosen is not None and first is not None:
         check_image_size(str(first), *image_size(first), chosen)
-    if format == "c3vd":
-        return read_c3vd(path, chosen, chosen_light, chosen_mask)
-    if format == "simcol":
-        if chosen is None and map_camera is not None and simcol.camera_file(path) is None:
-            chosen = _at_size_of_images(map_camera, path)
-        return read_simcol(path, chosen, chosen_light, chosen_mask)
-    if format == "hamlyn":
-        if chosen is None and map_camera is not None and not (path / "intrinsics.txt").is_file():
-            chosen = _at_size_of_images(map_camera, _image_folder(path, format))
-        return read_hamlyn(path, chosen, chosen_light, chosen_mask)
-    if format == "scared":
-        return read_scared(path, chosen, chosen_light, chosen_mask)
-    if format == "endoslam":
-        if chosen is None and map_camera is not None and endoslam.camera_file(path) is None:
-            chosen = _at_size_of_images(map_camera, _image_folder(path, format))
-        return read_endoslam(path, chosen, chosen_light, chosen_mask)
-    if format == "endomapper":
-        if chosen is None and map_camera is not None:
-            chosen = _at_size_of_images(map_camera, _image_folder(path, format))
-        return read_endomapper(path, chosen, chosen_light, chosen_mask)
-    if chosen is None and map_camera is not None and not (path / "camera.json").is_file():
-        chosen = _at_size_of_images(map_camera, _image_folder(path, format))
-    return read_folder(path, chosen, chosen_light, chosen_mask)
+    if chosen is None and map_camera is not None and not data_set.has_camera(path):
+        chosen = _at_size_of_images(map_camera, images)
+    return data_set.read(path, chosen, chosen_light, chosen_mask)
 
 
 def _is_cluster(path: Path, format: str | None) -> bool:
@@ -121,15 +91,15 @@ def _is_cluster(path: Path, format: str | None) -> bool:
     return format in (None, "endomapper") and endomapper.cluster_of(path) is not None
 
 
-def _looks_like(path: Path) -> str | None:
+def _looks_like(path: Path) -> Format | None:
     """The data set whose files a folder has."""
-    return next((name for name, fits in _LOOKS.items() if fits(path)), None)
+    return next((data_set for data_set in _DATA_SETS if data_set.fits(path)), None)
 
 
 def _other_format(path: Path, format: str) -> str:
     """What to try where the format that was named does not fit."""
     other = _looks_like(path)
-    return "" if other is None or other == format else f". By its files it looks like --format {other}"
+    return "" if other is None or other.name == format else f". By its files it looks like --format {other.name}"
 
 
 def _folders_below(path: Path) -> str:
@@ -149,19 +119,7 @@ def _folders_below(path: Path) -> str:
 
 
 def _is_sequence(path: Path) -> bool:
-    return _looks_like(path) is not None or _first_image(_image_folder(path, "folder")) is not None
-
-
-def _image_folder(path: Path, format: str) -> Path:
-    if format == "endomapper":
-        return endomapper.image_folder(path)
-    if format == "c3vd":
-        return c3vd.image_folder(path)
-    if format == "hamlyn":
-        return hamlyn.image_folder(path)
-    if format == "endoslam":
-        return endoslam.image_folder(path)
-    return path / "frames" if (path / "frames").is_dir() else path
+    return any(data_set.fits(path) for data_set in _BY_NAME.values())
 
 
 def _read_camera(file: Path, folder: Path) -> CameraModel:
@@ -191,12 +149,7 @@ def _open_video(
 def _at_size_of_images(camera: CameraModel, folder: Path) -> CameraModel:
     """A map's camera at the size of the images: a SLAM often works at half size. Cropped images are refused."""
     size = _size_of_images(folder)
-    if size is None:
-        return camera
-    width, height = size
-    if abs(width / camera.width / (height / camera.height) - 1) > 0.01:
-        check_image_size(str(folder), width, height, camera)
-    return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
+    return camera if size is None else endomapper.at_size(camera, *size, str(folder))
 
 
 def _size_of_images(folder: Path) -> tuple[int, int] | None:

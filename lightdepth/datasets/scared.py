@@ -14,42 +14,37 @@ or NaN where missing; points of later frames were made by moving the keyframe's 
 centre is at (0, 0). A fifth coefficient k3 is folded into the other four, unless that moves a pixel by more than half
 a pixel. The light is not known.
 
-Archives are read where they are, a member at a time and by its name alone; going back in one starts from its beginning,
-so extract scene_points.tar.gz before training.
+Going back in an archive starts from its beginning, so extract scene_points.tar.gz before training.
 """
 
 from __future__ import annotations
 
-import io
 import json
-import os
 import re
-import tarfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from lightdepth.calibration.opencv import read_matrices
-from lightdepth.camera import Brown, CameraModel, Pinhole, camera_from_params
+from lightdepth.camera import Brown, CameraModel, camera_from_params
 from lightdepth.camera_conversion import without_k3
 from lightdepth.datasets.checks import AS_GIVEN, INVERSE, READINGS, fitting_reading
-from lightdepth.datasets.sequence import FrameSequence, along_ray, numbered_files
+from lightdepth.datasets.folder import image_folder
+from lightdepth.datasets.format import Format
+from lightdepth.datasets.scared_files import IMAGES, VIDEO, StereoVideo, numbered_members
+from lightdepth.datasets.sequence import FrameSequence, along_ray
 from lightdepth.errors import InputError
-from lightdepth.files.images import decode_raw, read_image, read_raw, to_bgr8
+from lightdepth.files.images import decode_raw, read_image, read_raw
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.sparse_map import check_rigid
 
-_VIDEO, _IMAGES = Path("data") / "rgb.mp4", {"left": "Left_Image.png", "right": "Right_Image.png"}
 _DATA, _POINTS = ("frame_data", r"frame_data(\d+)\.json"), ("scene_points", r"scene_points(\d+)\.tiff?")
-_LARGEST = 256 << 20  # bytes of one member of an archive: a scene's points are 31 MB
 _METRES = next(name for name in READINGS if "multiplied by 1000" in name and INVERSE not in name)
 _BAD = ("dataset_4", "dataset_5")
 
@@ -65,7 +60,7 @@ class _Calibration:
 
 def is_scared(path: Path) -> bool:
     """Whether a folder is a keyframe of SCARED, with its video or alone."""
-    return (path / _VIDEO).is_file() or all(
+    return (path / VIDEO).is_file() or all(
         (path / name).is_file() for name in ("Left_Image.png", "left_depth_map.tiff")
     )
 
@@ -81,23 +76,26 @@ def read_scared(
 
     The sequence of data/rgb.mp4, or where there is none the keyframe alone.
     """
-    if view not in _IMAGES:
+    if view not in IMAGES:
         raise InputError(f"view {view!r}; expected left or right")
     if any(part in _BAD for part in path.resolve().parts):
         warnings.warn(
             f"{path}: the calibration of {' and '.join(_BAD)} is known to be wrong; leave them out", stacklevel=3
         )
-    if (path / _VIDEO).is_file():
+    if (path / VIDEO).is_file():
         return _read_sequence(path, camera, light or PhotometricCalibration(), mask, view)
     return _read_keyframe(path, camera, light or PhotometricCalibration(), mask, view)
+
+
+FORMAT = Format("scared", fits=is_scared, images=image_folder, has_camera=lambda _: True, read=read_scared)
 
 
 def _read_keyframe(
     path: Path, camera: CameraModel | None, light: PhotometricCalibration, mask: np.ndarray | None, view: str
 ) -> FrameSequence:
-    image, truth = path / _IMAGES[view], path / f"{view}_depth_map.tiff"
+    image, truth = path / IMAGES[view], path / f"{view}_depth_map.tiff"
     if not image.is_file():
-        raise InputError(f"{path}: neither {_VIDEO} nor {image.name} in it; is it a keyframe folder of SCARED?")
+        raise InputError(f"{path}: neither {VIDEO} nor {image.name} in it; is it a keyframe folder of SCARED?")
     height, width = read_image(image).shape[:2]
     if camera is None:
         camera = _camera(_read_yaml(path / "endoscope_calibration.yaml", view), width, height, path)
@@ -112,8 +110,8 @@ def _read_keyframe(
 def _read_sequence(
     path: Path, camera: CameraModel | None, light: PhotometricCalibration, mask: np.ndarray | None, view: str
 ) -> FrameSequence:
-    video = _Video(path / _VIDEO)
-    data, points = _members(path / "data", *_DATA), _members(path / "data", *_POINTS)
+    video = StereoVideo(path / VIDEO)
+    data, points = numbered_members(path / "data", *_DATA), numbered_members(path / "data", *_POINTS)
     records = {n: (name, _json(blob, name)) for n, name, blob in data.all()} if data is not None else {}
     if camera is None and not records:
         raise InputError(
@@ -122,7 +120,7 @@ def _read_sequence(
     numbers = sorted(records) if records else list(range(video.count))
     if numbers[-1] >= video.count:
         raise InputError(
-            f"{path}: there is frame data {numbers[-1]}, but {_VIDEO} has {video.count} frames, from 0; is it complete?"
+            f"{path}: there is frame data {numbers[-1]}, but {VIDEO} has {video.count} frames, from 0; is it complete?"
         )
     calibration = _from_json(*records[numbers[0]], view) if records else None
     if camera is None:
@@ -300,247 +298,3 @@ def _flat(value: Any, where: str) -> list[float]:
     if value is None or not np.isfinite(numbers).all():
         raise InputError(f"{where}: {'missing' if value is None else 'NaN or infinite'}; expected finite numbers")
     return numbers.tolist()
-
-
-# ---- files: members of an archive or of a folder, frames of the video
-
-
-class _Folder:
-    """Numbered files of a folder."""
-
-    cheap = True
-
-    def __init__(self, folder: Path, pattern: str):
-        self._files = numbered_files(folder, pattern)
-
-    def get(self, number: int) -> tuple[str, bytes] | None:
-        file = self._files.get(number)
-        return None if file is None else (str(file), file.read_bytes())
-
-    def all(self) -> list[tuple[int, str, bytes]]:
-        return [(n, str(file), file.read_bytes()) for n, file in self._files.items()]
-
-
-class _Archive:
-    """Numbered members of a .tar.gz. Nothing is unpacked to the disk; only the last part of a member's name counts."""
-
-    cheap = False
-
-    def __init__(self, path: Path, pattern: str):
-        self._path, self._pattern = path, pattern
-        self._found: dict[int, tarfile.TarInfo] = {}
-        self._tar: tarfile.TarFile | None = None
-        self._complete = False
-        self._process = 0
-
-    def get(self, number: int) -> tuple[str, bytes] | None:
-        try:
-            self._open()
-            while number not in self._found and not self._complete:
-                self._next()
-            return self._read(number) if number in self._found else None
-        except (OSError, EOFError, tarfile.TarError) as error:
-            raise self._broken(error) from error
-
-    def all(self) -> list[tuple[int, str, bytes]]:
-        """Every member in the archive's own order, which costs one pass."""
-        members = []
-        try:
-            self._open()
-            while not self._complete:
-                number = self._next()
-                if number is not None:
-                    members.append((number, *self._read(number)))
-        except (OSError, EOFError, tarfile.TarError) as error:
-            raise self._broken(error) from error
-        return members
-
-    def _open(self) -> None:
-        if self._process != os.getpid():  # a data loader's worker must not share the place in the file
-            self._tar = tarfile.open(self._path, "r:*")  # noqa: SIM115 - the next frame goes on from here
-            self._found, self._complete, self._process = {}, False, os.getpid()
-
-    def _next(self) -> int | None:
-        """Steps to the next member; its number, if it is one of ours."""
-        assert self._tar is not None
-        member = self._tar.next()
-        if member is None:
-            self._complete = True
-            return None
-        match = re.fullmatch(self._pattern, member.name.replace("\\", "/").rsplit("/", 1)[-1])
-        if match is None or not member.isfile():
-            return None
-        if int(match[1]) in self._found:
-            raise InputError(f"{self._path}: two members have the number {int(match[1])}")
-        if member.size > _LARGEST:
-            raise InputError(f"{self._path}: {member.name} has {member.size} bytes; expected at most {_LARGEST}")
-        self._found[int(match[1])] = member
-        return int(match[1])
-
-    def _read(self, number: int) -> tuple[str, bytes]:
-        assert self._tar is not None
-        member = self._found[number]
-        stream = self._tar.extractfile(member)
-        assert stream is not None
-        return f"{self._path}: {member.name}", stream.read()
-
-    def _broken(self, error: Exception) -> InputError:
-        return InputError(f"{self._path}: cannot be read ({error}); copied incompletely, or not a .tar.gz?")
-
-
-def _members(folder: Path, name: str, pattern: str) -> _Folder | _Archive | None:
-    """The extracted folder where there is one, else the archive."""
-    if numbered_files(folder / name, pattern):
-        return _Folder(folder / name, pattern)
-    archive = folder / f"{name}.tar.gz"
-    return _Archive(archive, pattern) if archive.is_file() else None
-
-
-class _Video:
-    """Frames of rgb.mp4 by number; in order they cost one decoding each."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._container: Any = None
-        self._frames: Any = None
-        self._next = 0
-        self._last: tuple[int, np.ndarray] | None = None
-        self._process = 0
-        with self._opened() as container:
-            stream = container.streams.video[0]
-            self.width, rows = stream.codec_context.width, stream.codec_context.height
-            self.fps = float(stream.average_rate or 25)
-            self.count = stream.frames or sum(1 for _ in container.demux(stream)) - 1  # demuxing ends with an empty one
-        if rows % 2:
-            raise InputError(f"{path}: {self.width}x{rows}; expected the left view above the right, of one height")
-        self.height = rows // 2
-
-    def _opened(self) -> Any:
-        import av
-
-        try:
-            return av.open(str(self._path))
-        except (OSError, av.error.FFmpegError) as error:
-            raise InputError(f"{self._path}: not a readable video ({error})") from error
-
-    def frame(self, number: int) -> np.ndarray:
-        """(2 H, W, 3) float32 RGB in [0, 1], both views."""
-        import av
-
-        if self._last is not None and self._last[0] == number:
-            return self._last[1]
-        try:
-            if self._process != os.getpid() or not self._next <= number <= self._next + 60:
-                self._seek(number)
-            while True:
-                frame = next(self._frames)
-                found = self._index(frame)
-                self._next = found + 1
-                if found >= number:
-                    break
-        except (StopIteration, av.error.FFmpegError) as error:
-            raise InputError(f"{self._path}: frame {number} cannot be decoded; is the video complete?") from error
-        if found != number:
-            raise InputError(f"{self._path}: there is no frame {number}; the next is {found}")
-        self._last = (number, frame.to_ndarray(format="rgb24").astype(np.float32) / np.float32(255))
-        return self._last[1]
-
-    def _seek(self, number: int) -> None:
-        """To the last frame before `number` that is coded by itself."""
-        if self._process != os.getpid():  # a data loader's worker must not share the place in the file
-            self._container, self._process = self._opened(), os.getpid()
-        stream = self._container.streams.video[0]
-        time = int(number / (self.fps * stream.time_base)) + (stream.start_time or 0)
-        self._container.seek(time, stream=stream)
-        self._frames = self._container.decode(stream)
-
-    def _index(self, frame: Any) -> int:
-        stream = self._container.streams.video[0]
-        return round(float((frame.pts - (stream.start_time or 0)) * stream.time_base) * self.fps)
-
-
-# ---- writing
-
-
-def write_scared(frames: Sequence[Frame], path: Path, archives: bool = True, metres: bool = False) -> None:
-    """A keyframe folder as it is shipped, the first frame its keyframe, of frames of one pinhole or Brown camera.
-
-    `archives` False leaves frame_data/ and scene_points/ extracted; `metres` writes the poses so. No right view was
-    rendered: the left is shown in its place, without points. The video is compressed (H.264), so colours are not exact.
-    """
-    if not len(frames):
-        raise InputError(f"{path}: no frames to write")
-    camera = frames[0].camera
-    if not isinstance(camera, Pinhole | Brown) or camera.width % 2 or camera.height % 2:
-        raise InputError(
-            f"{path}: {camera.name} {camera.width}x{camera.height}; expected a PINHOLE or OPENCV, even sizes"
-        )
-    fx, fy, cx, cy, *distortion = camera.with_pixel_center(1.0).params
-    matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-    lens, stereo = [*(distortion or [0.0] * 4), 0.0], {"R": np.eye(3).tolist(), "T": [-4.2, 0.0, 0.0]}
-    data = path / "data"
-    data.mkdir(parents=True)
-    _write_video(frames, data / "rgb.mp4")
-    records, points = {}, {}
-    for i, frame in enumerate(frames):
-        if frame.true_world_from_cam is not None:
-            pose = np.linalg.inv(frame.true_world_from_cam)
-            pose[:3, 3] *= 0.001 if metres else 1
-            record = {"KL": matrix, "DL": lens, "KR": matrix, "DR": lens, **stereo}
-            text = json.dumps({"camera-calibration": record, "camera-pose": pose.tolist()})
-            records[f"frame_data{i:06d}.json"] = text.encode()
-        if frame.true_distance is not None:
-            xyz = _points(frame)
-            both = np.concatenate([xyz, np.full_like(xyz, np.nan)])
-            points[f"scene_points{i:06d}.tiff"] = _tiff(both)
-    for name, members in (("frame_data", records), ("scene_points", points)):
-        if members and archives:
-            _write_archive(members, data / f"{name}.tar.gz")
-        elif members:
-            (data / name).mkdir()
-            for member, blob in members.items():
-                (data / name / member).write_bytes(blob)
-    for image in _IMAGES.values():
-        cv2.imwrite(str(path / image), to_bgr8(frames[0].image))
-    if frames[0].true_distance is not None:
-        xyz = _points(frames[0])
-        (path / "left_depth_map.tiff").write_bytes(_tiff(np.where(xyz[..., 2:] > 0, xyz, np.nan).astype(np.float32)))
-    store = cv2.FileStorage(str(path / "endoscope_calibration.yaml"), cv2.FILE_STORAGE_WRITE)
-    for side in "12":
-        store.write(f"M{side}", np.array(matrix))
-        store.write(f"D{side}", np.array([lens]))
-    store.write("R", np.eye(3))
-    store.write("T", np.array([stereo["T"]]).T)
-    store.release()
-
-
-def _points(frame: Frame) -> np.ndarray:
-    """(H, W, 3) float32 X Y Z in the camera, zero where unknown."""
-    assert frame.true_distance is not None
-    return (frame.camera.rays()[0] * np.where(frame.valid, frame.true_distance, 0)[..., None]).astype(np.float32)
-
-
-def _tiff(points: np.ndarray) -> bytes:
-    return cv2.imencode(".tiff", np.ascontiguousarray(points[..., ::-1]))[1].tobytes()
-
-
-def _write_archive(members: dict[str, bytes], path: Path) -> None:
-    with tarfile.open(path, "w:gz") as tar:
-        for name, blob in members.items():
-            entry = tarfile.TarInfo(name)
-            entry.size = len(blob)
-            tar.addfile(entry, io.BytesIO(blob))
-
-
-def _write_video(frames: Sequence[Frame], path: Path) -> None:
-    import av
-
-    with av.open(str(path), "w") as container:
-        stream: Any = container.add_stream("libx264", rate=Fraction(25), options={"crf": "4", "g": "5"})
-        height, width = frames[0].image.shape[:2]
-        stream.width, stream.height, stream.pix_fmt = width, 2 * height, "yuv420p"
-        for frame in frames:
-            rgb = np.ascontiguousarray(to_bgr8(frame.image)[..., ::-1])
-            both = av.VideoFrame.from_ndarray(np.concatenate([rgb, rgb]), format="rgb24")
-            container.mux(stream.encode(both))
-        container.mux(stream.encode())

@@ -202,7 +202,7 @@ def warn_of_gaps(source: Path, numbers: Sequence[int], known: Container[int]) ->
         warnings.warn(
             f"{source}: no depth for {len(without)} of {len(numbers)} frames, the first is frame {without[0]}; they "
             "have no truth. Is the data set there whole?",
-            stacklevel=4,
+            stacklevel=5,
         )
 
 

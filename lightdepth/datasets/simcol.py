@@ -19,14 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole
-from lightdepth.datasets.sequence import (
-    FrameSequence,
-    along_ray,
-    check_one_size,
-    numbered_files,
-    read_code,
-    warn_of_gaps,
-)
+from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
+from lightdepth.datasets.sequence import FrameSequence, numbered_files
 from lightdepth.errors import InputError
 from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.frame import Frame
@@ -34,6 +28,7 @@ from lightdepth.photometry import PhotometricCalibration
 
 FULL_SCALE_MM = 200.0
 _TOP = 255 * 256
+_CODE = DepthCode("SimCol3D", _TOP, FULL_SCALE_MM, clipped=_TOP)
 _FLIP = np.diag([1.0, -1.0, 1.0, 1.0])
 _COLOUR, _DEPTH = r"FrameBuffer_(\d+)\.png", r"Depth_(\d+)\.png"
 _POSITION, _ROTATION = "SavedPosition", "SavedRotationQuaternion"
@@ -57,16 +52,15 @@ def read_simcol(
 ) -> FrameSequence:
     """Frames of a SimCol3D trajectory, with distance and pose where the data set has them."""
     colour, depth = numbered_files(path, _COLOUR), numbered_files(path, _DEPTH)
-    numbers = sorted(colour)
-    if not numbers:
+    images = [colour[n] for n in sorted(colour)]
+    if not images:
         raise InputError(f"{path}: no FrameBuffer_NNNN.png in it; is it a Frames_ folder of SimCol3D?")
-    check_one_size([colour[n] for n in numbers])
-    warn_of_gaps(path, numbers, depth)
+    numbers = checked_images(path, images, depth)
     if camera is None:
         file = camera_file(path)
         if file is None:
             raise InputError(f"{path}: no cam.txt here or in the folder above; put it there, or give --camera FILE")
-        height, width = read_image(colour[numbers[0]]).shape[:2]
+        height, width = read_image(images[0]).shape[:2]
         # read_camera takes a bare matrix as OpenCV's, with the first centre at (0, 0): undone
         camera = read_camera(file, (width, height)).with_pixel_center(1.0)
     poses = _read_poses(path)
@@ -76,26 +70,24 @@ def read_simcol(
             "for each frame, from frame 0"
         )
     ray_z = camera.rays()[0][..., 2]
-    names = [colour[n].stem for n in numbers]
+    return frames_of(
+        path,
+        images,
+        camera,
+        light or PhotometricCalibration(),
+        mask,
+        poses=None if poses is None else poses[numbers],
+        distance=lambda i: _CODE.distance(depth[numbers[i]], ray_z) if numbers[i] in depth else None,
+    )
 
-    def load(i: int) -> Frame:
-        number = numbers[i]
-        distance = None
-        if number in depth:
-            code = read_code(depth[number], ray_z, "SimCol3D")
-            known = (code > 0) & (code < _TOP)
-            distance = along_ray(code.astype(np.float32) / _TOP * FULL_SCALE_MM, known, ray_z)
-        return Frame(
-            names[i],
-            read_image(colour[number]),
-            camera,
-            light or PhotometricCalibration(),
-            mask,
-            true_distance=distance,
-            true_world_from_cam=None if poses is None else poses[number],
-        )
 
-    return FrameSequence(names, load, str(path))
+FORMAT = Format(
+    "simcol",
+    fits=is_simcol,
+    images=lambda path: path,
+    has_camera=lambda path: camera_file(path) is not None,
+    read=read_simcol,
+)
 
 
 def write_simcol(frames: Sequence[Frame], path: Path) -> None:

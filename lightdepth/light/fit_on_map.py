@@ -13,6 +13,7 @@ makes it larger. lightdepth.light.fit_on_truth finds the endoscope's own, from f
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -29,7 +30,8 @@ from lightdepth.models import ConstantModel, DeclineModel, working_size
 from lightdepth.observations import observed_distances
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness
 from lightdepth.prediction import DepthPrediction
-from lightdepth.robust import lmeds_scale
+from lightdepth.reporting.run import Run, plain
+from lightdepth.robust import lmeds_scale, mad_sigma, robust_weights
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 Model = Callable[[Frame], DepthPrediction]
@@ -39,7 +41,6 @@ GAMMAS, MUS = np.arange(0.6, 4.01, 0.2), np.arange(0.0, 6.01, 0.5)
 GAMMA_RANGE, MU_RANGE = (0.5, 5.0), (0.0, 10.0)
 PRIOR_GAMMA, PRIOR_MU = 0.6, 2.0  # deviations from the defaults that nobody would be surprised at
 POINTS_PER_WITNESS = 50.0  # neighbouring points share texture and slant: so many count as one against the prior
-TUKEY = 4.685
 
 
 @dataclass(frozen=True)
@@ -198,6 +199,36 @@ def fit_on_map(
     )
 
 
+def fit_assumed_light(
+    run: Run, frames: FrameSequence, sparse_map: SparseMap, judge: Model
+) -> PhotometricCalibration | None:
+    """The light that the map tells, where the frames' is only assumed and the judge does better with it; else
+    None.
+
+    What was fitted goes into the run's record as `light_fit`, and why nothing was into its log.
+    """
+    if frames[0].light != PhotometricCalibration():
+        return None
+    start = time.perf_counter()
+    try:
+        fit = fit_on_map(frames, sparse_map, judge)
+    except InputError as error:
+        run.log(f"light assumed, not fitted: {error}")
+        return None
+    run.record["light_fit"] = plain(
+        {
+            "summary": f"fitted on the map: {fit.summary()}",
+            "fitted": fit.fitted,
+            "uncertainty": fit.uncertainty,
+            "errors": fit.errors,
+            "used": fit.better,
+            "seconds": round(time.perf_counter() - start, 3),
+        }
+    )
+    run.log(f"light {run.record['light_fit']['summary']}")
+    return fit.light if fit.better else None
+
+
 def fit_samples(
     samples: Sequence[LightSamples], rng: np.random.Generator | None = None, draws: int = 200
 ) -> tuple[float, float, dict[str, float], list[np.ndarray]]:
@@ -215,8 +246,8 @@ def fit_samples(
     moments, gram_prior, pull = np.zeros((len(samples), 3, 3)), np.zeros((2, 2)), np.zeros(2)
     for _ in range(30):
         residuals = [r - _shortest_half(r)[1] for r in _residuals(samples, gamma, mu)]
-        sigma = max(1.4826 * float(np.median([np.median(np.abs(r)) for r in residuals])), 1e-6)
-        moments = np.stack([_moments(s, r, TUKEY * sigma) for s, r in zip(samples, residuals, strict=True)])
+        sigma = mad_sigma(np.array([np.median(np.abs(r)) for r in residuals]), least=1e-6)
+        moments = np.stack([_moments(s, r, sigma) for s, r in zip(samples, residuals, strict=True)])
         precision = POINTS_PER_WITNESS * sigma**2 / np.square([PRIOR_GAMMA / 2, PRIOR_MU / 2])
         gram_prior, pull = np.diag(precision), precision * (DEFAULT_GAMMA / 2, DEFAULT_MU / 2)
         before, (gamma, mu) = (gamma, mu), _solved(moments.sum(0), gram_prior, pull)
@@ -242,9 +273,9 @@ def _shortest_half(values: np.ndarray) -> tuple[float, float]:
     return float(lengths[first]), float(ordered[first] + ordered[first + half]) / 2
 
 
-def _moments(samples: LightSamples, residual: np.ndarray, reach: float) -> np.ndarray:
+def _moments(samples: LightSamples, residual: np.ndarray, sigma: float) -> np.ndarray:
     """(3, 3) weighted second moments of (log a, -log V, -(1 - cos psi)), free of the keyframe's constant."""
-    weight = np.clip(1 - (residual / reach) ** 2, 0, None) ** 2
+    weight = robust_weights(residual / sigma, "tukey")
     table = np.stack([samples.log_distance, -samples.log_v, -samples.off_axis], 1)
     table = table - weight @ table / max(float(weight.sum()), 1e-9)
     return table.T @ (weight[:, None] * table)

@@ -26,6 +26,7 @@ from lightdepth.light.fit_on_map import GAMMA_RANGE, MU_RANGE, SATURATED, LightF
 from lightdepth.models import working_size
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness
 from lightdepth.radiosity import indirect_irradiance
+from lightdepth.robust import mad_sigma, robust_weights
 
 V_RANGE = (0.05, 0.75)  # darker is noise, brighter is where tone curves bend
 BLUR = 0.008  # of the image height: enough against noise, too little to mix a fold with what lies behind it
@@ -161,8 +162,8 @@ def _residuals(pixels: _Pixels, state: _State | None) -> np.ndarray:
 
 
 def _residual(frames: Sequence[_Pixels], state: _State | None) -> float:
-    """1.4826 times the median |residual| over all pixels."""
-    return 1.4826 * float(np.median(np.abs(np.concatenate([_residuals(p, state) for p in frames]))))
+    """Standard deviation of the residuals of all pixels, from their median size."""
+    return mad_sigma(np.concatenate([_residuals(p, state) for p in frames]))
 
 
 def _fitted(frames: Sequence[_Pixels], state: _State, free_cosine: bool, rounds: int = 3) -> _State:
@@ -182,10 +183,10 @@ def _step(frames: Sequence[_Pixels], bounced: Sequence[np.ndarray], state: _Stat
     known = np.array([1.0, state.mu, state.q]) / state.gamma
     residuals = [p.log_v - t @ known for p, t in zip(frames, tables, strict=True)]
     residuals = [r - np.median(r) for r in residuals]
-    sigma = max(1.4826 * float(np.median(np.abs(np.concatenate(residuals)))), 1e-6)
+    sigma = mad_sigma(np.concatenate(residuals), least=1e-6)
     for p, t, r in zip(frames, tables, residuals, strict=True):
         size = np.abs(r) / sigma
-        weight = np.where(size < 4, np.minimum(1, 1.345 / np.maximum(size, 1e-9)), 0)
+        weight = np.where(size < 4, robust_weights(size, "huber"), 0)
         t = t - weight @ t / weight.sum()
         gram += t.T @ (weight[:, None] * t)
         right += t.T @ (weight * (p.log_v - weight @ p.log_v / weight.sum()))

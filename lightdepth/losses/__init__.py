@@ -19,7 +19,7 @@ from lightdepth.losses.light import (
     specular_loss,
     ssim_loss,
 )
-from lightdepth.losses.masked import masked_mean, masked_median
+from lightdepth.losses.masked import masked_median, mean_over_images
 from lightdepth.losses.surface import albedo_loss, facing_loss, smoothness_guide, smoothness_loss
 from lightdepth.losses.total import Seen, render_image, self_supervised_loss, training_loss
 from lightdepth.losses.truth import log_error, supervised_loss, uncertainty_loss
@@ -33,7 +33,7 @@ __all__ = [
     "facing_loss",
     "indirect_light",
     "log_error",
-    "masked_mean",
+    "mean_over_images",
     "masked_median",
     "photometric_loss",
     "render_image",

@@ -16,7 +16,7 @@ from kornia.metrics import ssim
 from torch import Tensor
 
 from lightdepth.losses.config import LossConfig
-from lightdepth.losses.masked import masked_mean, masked_median
+from lightdepth.losses.masked import masked_median, mean_over_images
 from lightdepth.photometry import LightTerms, brightness, decode, encode, hue_saturation_albedo, irradiance
 from lightdepth.radiosity import indirect_irradiance
 
@@ -79,14 +79,16 @@ def rgb_residual(image: Tensor, rendered: Tensor, gamma: Tensor, space: str) -> 
 
 def photometric_loss(residual: Tensor, usable: Tensor, huber: float) -> Tensor:
     """Huber(residual) / huber over the usable pixels: valid, not black, not saturated. L1 with huber 0."""
-    return masked_mean(F.smooth_l1_loss(residual, torch.zeros_like(residual), reduction="none", beta=huber), usable)
+    return mean_over_images(
+        F.smooth_l1_loss(residual, torch.zeros_like(residual), reduction="none", beta=huber), usable
+    )
 
 
 def ssim_loss(image: Tensor, rendered: Tensor, usable: Tensor) -> Tensor:
     """(1 - SSIM(I, I')) / 2 over windows of 5x5 usable pixels (Wang et al. 2004), RGB as encoded."""
     shown = torch.where(usable, rendered.clamp(0, 1), image)
     whole = -F.max_pool2d(-usable.to(image.dtype), _SSIM_WINDOW, 1, _SSIM_WINDOW // 2) > 0.5
-    return masked_mean((1 - ssim(image, shown, _SSIM_WINDOW)) / 2, whole)
+    return mean_over_images((1 - ssim(image, shown, _SSIM_WINDOW)) / 2, whole)
 
 
 def saturated_loss(residual: Tensor, saturated: Tensor, usable: Tensor, huber: float) -> Tensor:
@@ -96,16 +98,16 @@ def saturated_loss(residual: Tensor, saturated: Tensor, usable: Tensor, huber: f
     """
     darker = residual.clamp(min=0)
     known = saturated & usable.flatten(1).any(1).reshape(-1, 1, 1, 1)
-    return masked_mean(F.smooth_l1_loss(darker, torch.zeros_like(darker), reduction="none", beta=huber), known)
+    return mean_over_images(F.smooth_l1_loss(darker, torch.zeros_like(darker), reduction="none", beta=huber), known)
 
 
 def specular_loss(normals: Tensor, rays: Tensor, highlights: Tensor) -> Tensor:
     """1 - cos on highlights: light and eye coincide, so that a mirror shows the light where it faces it."""
-    return masked_mean(1 + (normals * rays).sum(1, keepdim=True), highlights)
+    return mean_over_images(1 + (normals * rays).sum(1, keepdim=True), highlights)
 
 
 def chroma_loss(albedo_hs: Tensor, image: Tensor, light: LightTerms, mask: Tensor) -> Tensor:
     """|(I / V)^gamma - rho|: with value 1 the albedo's colour is the image's, whatever the distance."""
     v = brightness(image)
     seen = decode((image / v.clamp(min=_CHROMA_V)).clamp(max=1), light.gamma)
-    return masked_mean((seen - hue_saturation_albedo(albedo_hs)).abs(), mask & (v > _CHROMA_V))
+    return mean_over_images((seen - hue_saturation_albedo(albedo_hs)).abs(), mask & (v > _CHROMA_V))

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 
-def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean inside the mask of each image, then over images; values outside may be anything, NaN included."""
+def mean_over_images(values: Tensor, mask: Tensor) -> Tensor:
+    """One number: the mean over images of the mean inside each one's mask. Values outside it may be anything, NaN
+    included; an image with an empty mask counts as 0."""
     kept = torch.where(mask, values, torch.zeros_like(values))
     return (kept.sum((1, 2, 3)) / mask.expand_as(values).sum((1, 2, 3)).clamp(min=1)).mean()
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lightdepth.decline import masked_blur
-from lightdepth.losses.masked import masked_mean
+from lightdepth.losses.masked import mean_over_images
 from lightdepth.photometry import hue_saturation_albedo
 
 ROWS = 112
@@ -15,7 +15,7 @@ ROWS = 112
 
 def facing_loss(normals: Tensor, rays: Tensor, mask: Tensor, floor: float) -> Tensor:
     """max(floor - cos, 0): surfaces that are seen are not edge-on."""
-    return masked_mean((floor + (normals * rays).sum(1, keepdim=True)).clamp(min=0), mask)
+    return mean_over_images((floor + (normals * rays).sum(1, keepdim=True)).clamp(min=0), mask)
 
 
 def smoothness_guide(log_seen: Tensor, mask: Tensor) -> Tensor:
@@ -42,7 +42,7 @@ def smoothness_loss(log_distance: Tensor, guide: Tensor, mask: Tensor) -> Tensor
         second = part(log_distance, 0) - 2 * part(log_distance, 1) + part(log_distance, 2)
         edge = (part(guide, 2) - part(guide, 0)).abs() / 2
         inside = part(mask, 0) & part(mask, 1) & part(mask, 2)
-        total = total + masked_mean(second.abs() * rows**2 * torch.exp(-5 * rows * edge), inside)
+        total = total + mean_over_images(second.abs() * rows**2 * torch.exp(-5 * rows * edge), inside)
     return total / 2
 
 
@@ -62,4 +62,4 @@ def steps(values: Tensor, mask: Tensor, axis: int) -> Tensor:
         return values.new_zeros(())
     step = values.narrow(axis, 1, length) - values.narrow(axis, 0, length)
     both = mask.narrow(axis, 1, length) & mask.narrow(axis, 0, length)
-    return masked_mean(step.abs(), both) * (values.shape[-2] / ROWS)
+    return mean_over_images(step.abs(), both) * (values.shape[-2] / ROWS)

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from lightdepth.losses.masked import masked_mean, masked_median
+from lightdepth.losses.masked import masked_median, mean_over_images
 from lightdepth.losses.surface import steps
 
 
@@ -17,7 +17,7 @@ def supervised_loss(distance: Tensor, true_distance: Tensor, true_valid: Tensor)
     error = torch.where(true_valid, error, torch.zeros_like(error))
     mean = error.sum((1, 2, 3), keepdim=True) / true_valid.sum((1, 2, 3), keepdim=True).clamp(min=1)
     gradient = steps(error, true_valid, -1) + steps(error, true_valid, -2)
-    return {"supervised": 3 * masked_mean((error - mean).abs(), true_valid), "supervised_gradient": 3 * gradient}
+    return {"supervised": 3 * mean_over_images((error - mean).abs(), true_valid), "supervised_gradient": 3 * gradient}
 
 
 def log_error(distance: Tensor, true_distance: Tensor, true_valid: Tensor) -> Tensor:
@@ -28,4 +28,4 @@ def log_error(distance: Tensor, true_distance: Tensor, true_valid: Tensor) -> Te
 
 def uncertainty_loss(log_sigma: Tensor, error: Tensor, valid: Tensor) -> Tensor:
     """sqrt(2) |e| / sigma + log sigma: minus the log likelihood of a Laplace density of standard deviation sigma."""
-    return masked_mean(math.sqrt(2) * error.detach().abs() * torch.exp(-log_sigma) + log_sigma, valid)
+    return mean_over_images(math.sqrt(2) * error.detach().abs() * torch.exp(-log_sigma) + log_sigma, valid)

@@ -39,8 +39,8 @@ def input_channels(names: tuple[str, ...]) -> int:
     return sum(CHANNELS[name] for name in names)
 
 
-def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean of (B, 1, H, W) inside the mask, (B, 1, 1, 1); 0 where the mask is empty."""
+def mean_per_image(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of each image (B, 1, H, W) inside its mask, (B, 1, 1, 1); 0 where the mask is empty."""
     total = torch.where(mask, values, 0).sum((-2, -1), keepdim=True)
     return total / mask.sum((-2, -1), keepdim=True).clamp(min=1)
 
@@ -53,7 +53,7 @@ def network_inputs(
     `blur` of the closed form as a share of the image height.
     """
     log_closed = log_closed_form(image, mask, rays, light, blur)
-    mean = masked_mean(log_closed, mask)
+    mean = mean_per_image(log_closed, mask)
     log_closed = torch.where(mask, log_closed, mean)
     made = {
         "rgb": torch.where(mask, image - 0.5, 0),
@@ -70,8 +70,8 @@ def network_outputs(raw: Tensor, log_closed: Tensor, mask: Tensor, output: str) 
     shape = raw[:, :1].float()
     if output == "free":
         return shape.clamp(-_LOG_LIMIT, _LOG_LIMIT).exp(), raw[:, 1:].float().sigmoid()
-    base = log_closed if output == "residual" else masked_mean(log_closed, mask)
-    log_distance = base + shape - masked_mean(shape, mask)
+    base = log_closed if output == "residual" else mean_per_image(log_closed, mask)
+    log_distance = base + shape - mean_per_image(shape, mask)
     return log_distance.clamp(-_LOG_LIMIT, _LOG_LIMIT).exp(), raw[:, 1:].float().sigmoid()
 
 

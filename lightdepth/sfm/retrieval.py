@@ -6,9 +6,11 @@ differ from the nearest of K visual words, which are made from the sequence itse
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.cluster.vq import kmeans2, vq
 
 WORDS = 32
 
@@ -39,7 +41,7 @@ def vlad(descriptors: Sequence[np.ndarray], seed: int) -> np.ndarray:
     result = np.zeros((len(rooted), len(words), 128), np.float32)
     for i, features in enumerate(rooted):
         if len(features):
-            nearest = _nearest(features, words)
+            nearest, _ = vq(features, words)
             np.add.at(result[i], nearest, features - words[nearest])
     length = np.linalg.norm(result, axis=2, keepdims=True)
     result /= np.where(length > 0, length, 1)  # so that a pattern that repeats counts once
@@ -60,14 +62,6 @@ def _words(rooted: Sequence[np.ndarray], rng: np.random.Generator, rounds: int =
         return every if len(every) else np.zeros((1, 128), np.float32)
     sample = every[np.sort(rng.permutation(len(every))[:most])]
     words = sample[np.sort(rng.permutation(len(sample))[:WORDS])]
-    for _ in range(rounds):
-        nearest = _nearest(sample, words)
-        counts = np.bincount(nearest, minlength=len(words))
-        sums = np.zeros_like(words)
-        np.add.at(sums, nearest, sample)
-        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
-    return words
-
-
-def _nearest(features: np.ndarray, words: np.ndarray) -> np.ndarray:
-    return ((words**2).sum(1) - 2 * features @ words.T).argmin(1)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "One of the clusters is empty")  # its word stays where it was
+        return kmeans2(sample, words, iter=rounds, minit="matrix")[0]

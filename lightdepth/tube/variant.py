@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from kornia.color import linear_rgb_to_rgb
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
@@ -143,8 +144,7 @@ class VariantTube(Tube):
         exposure = linear.new_tensor([own.uniform(0.5, 1.1) for own in owns]).reshape(-1, 1, 1, 1)
         pixels = linear * exposure / quantiles(linear.amax(1), seen, 0.75).clamp(min=1e-12)
         pixels = 1.9 * pixels / (1 + pixels)
-        code = torch.where(pixels <= 0.0031308, 12.92 * pixels, 1.055 * pixels.clamp(min=1e-6) ** (1 / 2.4) - 0.055)
-        code = code + on_pixels(seen, lambda _, count: rng.normal(0, 0.006, (count, 3)))
+        code = linear_rgb_to_rgb(pixels) + on_pixels(seen, lambda _, count: rng.normal(0, 0.006, (count, 3)))
         image = (code.clamp(0, 1) * 255).round() / 255 * seen[:, None]
         return image.permute(0, 2, 3, 1).cpu().numpy()
 

@@ -25,7 +25,7 @@ from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, to_batch
-from lightdepth.robust import lmeds_scale, robust_weights
+from lightdepth.robust import lmeds_scale, mad_sigma, robust_weights
 from lightdepth.sparse_map import SparseMap, covisibility
 
 from ..datamodule import collate
@@ -170,6 +170,6 @@ def _at(image: Tensor, mask: Tensor, places: np.ndarray) -> tuple[Tensor, np.nda
 def _robust_mean(residual: Tensor) -> Tensor:
     """Mean |residual| (n,), weighted so that outliers do not count."""
     size = residual.detach().abs().double().cpu().numpy()
-    sigma = max(1.4826 * float(np.median(size)), _LEAST_SIGMA)
+    sigma = mad_sigma(size, _LEAST_SIGMA)
     weight = torch.as_tensor(robust_weights(size / sigma), dtype=residual.dtype, device=residual.device)
     return (weight * residual.abs()).sum() / weight.sum().clamp(min=1e-9)

@@ -23,14 +23,14 @@ from torch.nn.utils import parametrize
 
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch
-from lightdepth.losses import LossConfig, masked_mean, masked_median
+from lightdepth.losses import LossConfig, masked_median, mean_over_images
 from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
 from lightdepth.network.model import full_precision
+from train.adapting.map_teacher import MapTeacher, map_terms
 
 from ..colons import TubeData
-from .map_teacher import MapTeacher, map_terms
 
 What = Literal["all", "decoder", "norms", "low_rank"]
 WHAT = ("all", "decoder", "norms", "low_rank")
@@ -87,7 +87,7 @@ def merge(network: DepthNetwork) -> None:
 def anchor_loss(distance: Tensor, start: Tensor, mask: Tensor) -> Tensor:
     """Mean |log t - log t_start| inside the mask, after each image's median of it is taken out. All (B, 1, H, W)."""
     ratio = distance.log() - start.log()
-    return masked_mean((ratio - masked_median(ratio, mask)).abs(), mask)
+    return mean_over_images((ratio - masked_median(ratio, mask)).abs(), mask)
 
 
 def target_loss(card: dict[str, Any], reflectance_known: bool, replayed: bool) -> LossConfig:

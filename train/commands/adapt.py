@@ -23,7 +23,7 @@ from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model, save_model
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
-from lightdepth.light.fit_on_map import LightView, fit_on_map, map_views, with_light, withheld_error
+from lightdepth.light.fit_on_map import LightView, fit_assumed_light, map_views, with_light, withheld_error
 from lightdepth.maps import read_map
 from lightdepth.maps.checks import check_shared_frames
 from lightdepth.models import DeclineModel, DepthModel, NetworkModel, working_size
@@ -144,7 +144,7 @@ def adapt(
             # The map's camera, where the folder has none: for all sequences.
             source = replace(source, camera=run.folder / "camera.json")
             if source.light is None and fit_light:
-                fitted = _fitted_light(run, training, sparse_map, start)
+                fitted = fit_assumed_light(run, training, sparse_map, start)
                 if fitted is not None:
                     frames, training, held = (with_light(part, fitted) for part in (frames, training, held))
                     source = replace(source, light=str(run.folder / "light.json"))
@@ -253,22 +253,6 @@ def _parted(frames: FrameSequence, share: float) -> tuple[FrameSequence, FrameSe
     if first < 1:
         raise InputError(f"{frames.source}: {len(frames)} frame; expected at least two, one of them to judge by")
     return frames[:first], frames[first:]
-
-
-def _fitted_light(
-    run: Run, frames: FrameSequence, sparse_map: SparseMap, start: DepthModel
-) -> PhotometricCalibration | None:
-    """The light that the map tells, where the frames' is only assumed and the start does better with it."""
-    if frames[0].light != PhotometricCalibration():
-        return None
-    try:
-        fit = fit_on_map(frames, sparse_map, start)
-    except InputError as error:
-        run.log(f"light assumed, not fitted: {error}")
-        return None
-    run.record["light_fit"] = plain({"summary": fit.summary(), "errors": fit.errors, "used": fit.better})
-    run.log(f"light fitted on the map: {fit.summary()}")
-    return fit.light if fit.better else None
 
 
 def _views(run: Run, frames: FrameSequence, held: FrameSequence, sparse_map: SparseMap) -> list[LightView]:
@@ -387,7 +371,7 @@ def _page(
             "how right the distance is. It can fall while distance gets worse; a sparse map (--map) tells."
         )
     light = run.record.get("light_fit")
-    page.text(f"Light of the frames: {_said(seen)}." + (f" The map's: {light['summary']}." if light else ""))
+    page.text(f"Light of the frames: {_said(seen)}." + (f" Light {light['summary']}." if light else ""))
     page.heading(f"Before and after, on {held} frames that were held out")
     headers = ["model"]
     columns: list[list[float | None]] = []

@@ -1,0 +1,97 @@
+"""What the readers of folders share: the record by which `open_sequence` knows a data set, the checks of its images,
+and frames made of them one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lightdepth.camera import CameraModel
+from lightdepth.datasets.sequence import FrameSequence, along_ray, check_one_size, read_code, warn_of_gaps
+from lightdepth.files.images import read_image
+from lightdepth.frame import Frame, frame_number
+from lightdepth.photometry import PhotometricCalibration
+
+Reader = Callable[
+    [Path, CameraModel | None, PhotometricCalibration | None, np.ndarray | None],
+    FrameSequence,
+]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A data set: how its folders are told by their files, and how they are read."""
+
+    name: str
+    """What --format calls it."""
+    fits: Callable[[Path], bool]
+    """Whether a folder has the data set's files."""
+    images: Callable[[Path], Path]
+    """The folder in which the images of a sequence lie."""
+    has_camera: Callable[[Path], bool]
+    """Whether a sequence brings a camera that wins over a map's."""
+    read: Reader
+    """The frames of a folder; camera, light and mask win over the files in it where they are given."""
+
+
+@dataclass(frozen=True)
+class DepthCode:
+    """How a data set writes depth along the axis in 16 bits: full_mm * code / full; 0 is unknown, and `clipped` too."""
+
+    whose: str
+    """The data set's name, for messages."""
+    full: int = 1
+    """The code of `full_mm`."""
+    full_mm: float = 1.0
+    """Millimetres that `full` stands for."""
+    clipped: int = 1 << 16
+    """The least code that only says that the wall is farther; 65536, which no code reaches, where there is none."""
+
+    def distance(self, file: Path, ray_z: np.ndarray) -> np.ndarray:
+        """(H, W) float32 distance along the ray [mm], 0 where unknown, of an image with these rays' z."""
+        code = read_code(file, ray_z, self.whose)
+        return along_ray(code.astype(np.float32) / self.full * self.full_mm, (code > 0) & (code < self.clipped), ray_z)
+
+
+def checked_images(path: Path, images: Sequence[Path], depth: Container[int] | None = None) -> list[int]:
+    """The frame numbers of a sequence's images. Raises InputError where their sizes differ; where `depth` holds the
+    numbers of frames with depth, warns of the others."""
+    check_one_size(images)
+    numbers = [frame_number(image.name) for image in images]
+    if depth is not None:
+        warn_of_gaps(path, numbers, depth)
+    return numbers
+
+
+def frames_of(
+    path: Path,
+    images: Sequence[Path],
+    camera: CameraModel,
+    light: PhotometricCalibration,
+    mask: np.ndarray | None,
+    *,
+    names: Sequence[str] | None = None,
+    times: Sequence[float | None] | None = None,
+    poses: Sequence[np.ndarray | None] | np.ndarray | None = None,
+    distance: Callable[[int], np.ndarray | None] | None = None,
+) -> FrameSequence:
+    """The images as frames. Names (the files' stems where left out), times [s], poses and what reads the true distance
+    [mm] go by the image's place in the list."""
+    called = [image.stem for image in images] if names is None else names
+
+    def load(i: int) -> Frame:
+        return Frame(
+            called[i],
+            read_image(images[i]),
+            camera,
+            light,
+            mask,
+            time=None if times is None else times[i],
+            true_distance=None if distance is None else distance(i),
+            true_world_from_cam=None if poses is None else poses[i],
+        )
+
+    return FrameSequence(called, load, str(path))
