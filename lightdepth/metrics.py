@@ -12,7 +12,6 @@ Means are over frames, or over sequences (the mean of each sequence's mean). Med
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -95,9 +94,8 @@ class DepthErrors(Metric):
     total: Tensor
     frames: Tensor
 
-    def __init__(self, alignment: str = "median", sequences: int = 1, **options: Any) -> None:
-        """`options` are torchmetrics' own, for how processes meet."""
-        super().__init__(**options)
+    def __init__(self, alignment: str = "median", sequences: int = 1) -> None:
+        super().__init__()
         self.alignment = alignment
         self.add_state("total", torch.zeros(sequences, len(NAMES), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("frames", torch.zeros(sequences, dtype=torch.float64), dist_reduce_fx="sum")

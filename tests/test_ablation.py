@@ -24,7 +24,7 @@ from train.ablation.run import JudgedColons, Row, ablate
 from train.ablation.table import METRICS, Result, Table, clear, lines, markdown, write_table
 from train.cli import training_parser
 from train.colons import TubeData, with_reflectance
-from train.datamodule import FrameDataModule
+from train.datamodule import FrameData, FrameDataModule
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted((ROOT / "configs" / "ablation").glob("*.yaml"))
@@ -317,7 +317,9 @@ def test_reflectance_goes_into_the_network_that_asks_for_it_and_into_no_other():
 
 def test_a_wrong_and_a_random_reflectance_reach_what_is_trained_on(cheap):
     def seen(training: bool, **options) -> list[float]:
-        data = FrameDataModule(tube=TubeData(scenes=7, val_scenes=1, frames=1), size=(40, 32), augment=False, **options)
+        data = FrameDataModule(
+            FrameData(tube=TubeData(scenes=7, val_scenes=1, frames=1), size=(40, 32), augment=False, **options)
+        )
         data.setup()
         data.trainer = type("T", (), {"training": training, "global_step": 5, "global_rank": 0})()
         batches = data.val_dataloader() if not training else data.train_dataloader()
@@ -331,4 +333,4 @@ def test_a_wrong_and_a_random_reflectance_reach_what_is_trained_on(cheap):
     assert len(set(drawn)) == len(drawn) and all(0.3 <= v <= 0.5 for v in drawn)
     assert seen(False, random_reflectance=(0.3, 0.5)) == seen(False)
     with pytest.raises(InputError, match="random_reflectance"):
-        FrameDataModule(random_reflectance=(0.5, 0.2))
+        FrameDataModule(FrameData(random_reflectance=(0.5, 0.2)))

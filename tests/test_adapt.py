@@ -21,7 +21,7 @@ from train.adapting.module import Adaptation, anchor_loss, let_learn, merge, sou
 from train.colons import TubeData
 from train.commands.adapt import Judgement, Verdict, verdict
 from train.commands.adapt import adapt as adapt_verb
-from train.datamodule import FrameDataModule, collate
+from train.datamodule import FrameData, FrameDataModule, collate
 
 adapt = by_options(adapt_verb)
 
@@ -240,7 +240,9 @@ def test_an_anchored_network_stays_nearer_to_its_start():
 
 def test_replay_fills_the_second_half_of_every_batch_with_colons_of_the_source(sequences):
     tube = TubeData(scenes=1, frames=3, lenses=("pinhole",))
-    data = FrameDataModule([str(sequences / "plain")], tube=tube, halves=True, size=SIZE, batch_size=3, held_out=0.2)
+    data = FrameDataModule(
+        FrameData([str(sequences / "plain")], tube=tube, halves=True, size=SIZE, batch_size=3, held_out=0.2)
+    )
     data.setup()
     for epoch in range(2):
         names = [data.names(epoch, i) for i in range(len(data.train_dataloader()))]
@@ -249,7 +251,7 @@ def test_replay_fills_the_second_half_of_every_batch_with_colons_of_the_source(s
     batches = list(data.train_dataloader())
     assert all(b.true_valid.flatten(1).any(1).tolist() == [False, False, True] for b in batches)
     with pytest.raises(InputError, match="batch_size of at least 2"):
-        FrameDataModule(halves=True, batch_size=1)
+        FrameDataModule(FrameData(halves=True, batch_size=1))
 
 
 @pytest.mark.parametrize("replay", [False, True])

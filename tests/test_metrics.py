@@ -230,8 +230,8 @@ def test_processes_that_saw_parts_agree_on_the_whole():
     """As under DDP: what torchmetrics gathers from each process is summed."""
     whole, second = DepthErrors("median", sequences=2), DepthErrors("median", sequences=2)
     others = iter([second.total, second.frames])  # states are gathered in the order of their names' declaration
-    options = {"dist_sync_fn": lambda own, group=None: [own, next(others)], "distributed_available_fn": lambda: True}
-    first = DepthErrors("median", sequences=2, **options)
+    first = DepthErrors("median", sequences=2)
+    first.dist_sync_fn, first.distributed_available_fn = lambda own, group=None: [own, next(others)], lambda: True
     whole.update(*batch(0, 1, 2), torch.tensor([0, 1, 1]))
     first.update(*batch(0, 1), torch.tensor([0, 1]))
     second.update(*batch(2), torch.tensor([1]))

@@ -13,6 +13,7 @@ import torch
 from bad_stretches import Stretches, bad_stretches
 from colons import colon, slam
 from scenes import LENSES
+from verbs import by_options
 
 from lightdepth.camera import Pinhole
 from lightdepth.datasets import write_folder
@@ -21,8 +22,8 @@ from lightdepth.frame import Frame
 from lightdepth.maps import write_text_model
 from lightdepth.sparse_map import SparseMap
 from lightdepth.tube import ShapeConfig, TextureConfig, TubeConfig, lens
-from train.commands.select import select
-from train.datamodule import FrameDataModule
+from train.commands.select import select as select_verb
+from train.datamodule import FrameData, FrameDataModule
 from train.frame_lists import read_frame_list
 from train.selecting.covisibility import (
     BLUR,
@@ -47,6 +48,8 @@ from train.selecting.matching import (
     SiftMatcher,
     epipolar_inliers,
 )
+
+select = by_options(select_verb)
 
 CAMERA = Pinhole(8, 8, 8.0, 8.0, 4.0, 4.0)
 RULES = NodeRules(similarity=0.9, min_matches=10, min_spread=0.0, min_views=3, max_skipped=2, min_frames=1, max_views=9)
@@ -350,7 +353,7 @@ def test_the_verb_takes_a_map_in_place_of_matching(tmp_path):
 def names_read(module: FrameDataModule, monkeypatch) -> tuple[set[str], set[str]]:
     """Frames that an epoch of training and one of validation read from disk, as sequence/name."""
     read: set[str] = set()
-    import lightdepth.datasets.folder as folder
+    import lightdepth.datasets.format as folder
 
     original = folder.read_image
 
@@ -372,7 +375,7 @@ def test_training_reads_exactly_the_listed_frames_and_validates_on_the_last_of_t
     write_folder(colon().frames, tmp_path / "one")
     (tmp_path / "list.txt").write_text("# kept\n" + "".join(f"{i:06d}\n" for i in (0, 2, 3, 7, 8)))
     options = {"frames": str(tmp_path / "list.txt"), "size": (24, 20), "batch_size": 1}
-    trained, validated = names_read(FrameDataModule([str(tmp_path / "one")], **options), monkeypatch)
+    trained, validated = names_read(FrameDataModule(FrameData([str(tmp_path / "one")], **options)), monkeypatch)
     assert trained == {f"one/{i:06d}" for i in (0, 2, 3, 7)} and validated == {"one/000008"}
 
 
@@ -383,7 +386,7 @@ def test_frames_of_two_sequences_are_listed_with_their_folder(tmp_path, monkeypa
     listed = tmp_path / "list.txt"
     options = {"frames": str(listed), "size": (24, 20), "batch_size": 1}
     listed.write_text("one/000001\none/000002.png\ntwo/000005\ntwo/000006\ntwo/000009\n")
-    trained, validated = names_read(FrameDataModule(sequences, **options), monkeypatch)
+    trained, validated = names_read(FrameDataModule(FrameData(sequences, **options)), monkeypatch)
     assert trained == {"one/000001", "two/000005", "two/000006"} and validated == {"one/000002", "two/000009"}
     for text, said in (
         ("000001\n", "write folder/name"),
@@ -392,4 +395,4 @@ def test_frames_of_two_sequences_are_listed_with_their_folder(tmp_path, monkeypa
     ):
         listed.write_text(text)
         with pytest.raises(InputError, match=said):
-            FrameDataModule(sequences, **options).setup()
+            FrameDataModule(FrameData(sequences, **options)).setup()

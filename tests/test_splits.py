@@ -15,7 +15,7 @@ from lightdepth.datasets.catalogue import read_dataset_yaml
 from lightdepth.datasets.splits import check_apart, folders, read_split, same_sequence
 from lightdepth.errors import InputError
 from lightdepth.tube import lens
-from train.datamodule import FrameDataModule
+from train.datamodule import FrameData, FrameDataModule
 
 DATA = Path(__file__).parents[1] / "data"
 DATASETS = sorted(p for p in DATA.iterdir() if p.is_dir())
@@ -255,11 +255,11 @@ def test_training_takes_train_and_val_of_a_split_and_never_opens_its_test(split,
     for file in (root / "trans_t2_a").iterdir():
         file.unlink()  # opening it would fail
     path = split(parts(train='"trans_t1_a[1:3]"', val="trans_t1_b", test="trans_t2_a"))
-    data = FrameDataModule(split=str(path), root=str(root), size=(25, 20))
+    data = FrameDataModule(FrameData(split=str(path), root=str(root), size=(25, 20)))
     data.setup()
     assert data.counts == {"train": 2, "val": 4}
     assert data.sequences == [str(root / "trans_t1_a")] and data.val_sequences == [str(root / "trans_t1_b")]
-    chosen = FrameDataModule([str(root / "trans_t1_a")], [str(root / "trans_t1_b")], size=(25, 20))
+    chosen = FrameDataModule(FrameData([str(root / "trans_t1_a")], [str(root / "trans_t1_b")], size=(25, 20)))
     chosen.setup()
     assert (data._train[0].image == chosen._train[1].image).all()  # frames 1 and 2 of four
 
@@ -267,13 +267,13 @@ def test_training_takes_train_and_val_of_a_split_and_never_opens_its_test(split,
 def test_a_split_needs_its_root_a_training_part_and_no_sequences_beside_it(split, tree):
     root, path = str(tree("a")), str(split(parts(test="a")))
     with pytest.raises(InputError, match="no train in it"):
-        FrameDataModule(split=path, root=root).setup()
+        FrameDataModule(FrameData(split=path, root=root)).setup()
     with pytest.raises(InputError, match=r"go together: --data\.split FILE --data\.root DIR"):
-        FrameDataModule(split=path)
+        FrameDataModule(FrameData(split=path))
     with pytest.raises(InputError, match="not both"):
-        FrameDataModule([root], split=path, root=root)
+        FrameDataModule(FrameData([root], split=path, root=root))
     with pytest.raises(InputError, match=r"no frame in a\[7:9\]; its numbers are 0 to 3"):
-        FrameDataModule(split=str(split(parts(train='"a[7:9]"'))), root=root).setup()
+        FrameDataModule(FrameData(split=str(split(parts(train='"a[7:9]"'))), root=root)).setup()
 
 
 def test_the_shipped_split_trains_on_a_tree_of_its_sequences_without_a_word(tree):
@@ -281,7 +281,7 @@ def test_the_shipped_split_trains_on_a_tree_of_its_sequences_without_a_word(tree
     root = tree(*(c.name for part in ("train", "val") for c in named[part]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        data = FrameDataModule(split=str(LIGHTDEPTH), root=str(root), size=(25, 20))
+        data = FrameDataModule(FrameData(split=str(LIGHTDEPTH), root=str(root), size=(25, 20)))
         data.setup()
     assert data.counts == {"train": 4 * 12, "val": 4 * 2}
 
@@ -293,7 +293,7 @@ def test_fewer_frames_than_the_data_set_has_are_said(tree, tmp_path):
     (tmp_path / "c3vd" / "dataset.yaml").write_text((DATA / "c3vd" / "dataset.yaml").read_text())
     path.write_text("dataset: c3vd\n" + parts(train="desc_t4_a", val="trans_t1_a"))
     with pytest.warns(UserWarning, match="desc_t4_a: 4 frames; the data set has 148. Is it there whole"):
-        FrameDataModule(split=str(path), root=str(root), size=(25, 20)).setup()
+        FrameDataModule(FrameData(split=str(path), root=str(root), size=(25, 20))).setup()
 
 
 def test_folders_given_by_hand_to_train_and_validate_on_are_kept_apart(tree, tmp_path):
@@ -302,7 +302,7 @@ def test_folders_given_by_hand_to_train_and_validate_on_are_kept_apart(tree, tmp
     link.symlink_to(root / "a", target_is_directory=True)
     for val in (root / "a", root / "b" / ".." / "a", link, root, root / "a" / "frames"):
         with pytest.raises(InputError, match="validated on, but also trained on"):
-            FrameDataModule([str(root / "a")], [str(val)])
+            FrameDataModule(FrameData([str(root / "a")], [str(val)]))
     check_apart([root / "a"], [root / "b"])
 
 

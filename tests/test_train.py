@@ -31,7 +31,7 @@ from lightdepth.tube import lens
 from train.callbacks import validation_line
 from train.cli import train
 from train.colons import TubeData
-from train.datamodule import FrameDataModule, augmented, collate
+from train.datamodule import FrameData, FrameDataModule, augmented, collate
 from train.frame_lists import read_frame_list
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs" / "train").glob("*.yaml"))
@@ -94,7 +94,7 @@ def test_what_is_saturated_stays_saturated_however_dark_the_exposure():
 
 def test_synthetic_colons_follow_from_the_seed_and_validation_colons_are_others():
     def made(seed):
-        data = FrameDataModule(tube=TubeData(scenes=1, val_scenes=1, frames=2), size=(40, 32), seed=seed)
+        data = FrameDataModule(FrameData(tube=TubeData(scenes=1, val_scenes=1, frames=2), size=(40, 32), seed=seed))
         data.setup()
         assert data.counts == {"train": 2, "val": 2}
         return data._train[0], data._val[0]
@@ -112,18 +112,18 @@ def test_sequences_without_a_calibration_are_read_with_the_one_that_is_given(tmp
     for image in (whole / "frames").iterdir():
         (bare / "frames" / image.name).write_bytes(image.read_bytes())
     with pytest.raises(InputError, match=r"no camera\.json"):
-        FrameDataModule([str(bare)], size=(40, 32)).setup()
+        FrameDataModule(FrameData([str(bare)], size=(40, 32))).setup()
     white = np.full(open_sequence(whole)[0].image.shape[:2], 255, np.uint8)
     white[:8] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), white)
     given = {"camera": str(whole / "camera.json"), "light": "gamma=1.7,mu=0.5", "mask": str(tmp_path / "mask.png")}
-    data = FrameDataModule([str(bare)], size=(40, 32), **given)
+    data = FrameDataModule(FrameData([str(bare)], size=(40, 32), **given))
     data.setup()
     batch = next(iter(data.val_dataloader()))
     assert batch.light.gamma.unique() == torch.tensor(1.7) and batch.light.mu.unique() == 0.5
     assert not batch.mask[:, :, :2].any() and batch.mask[:, :, 8:].any()
     with pytest.raises(InputError, match="C3VD"):
-        FrameDataModule([str(bare)], size=(40, 32), format="c3vd", **given).setup()
+        FrameDataModule(FrameData([str(bare)], size=(40, 32), format="c3vd", **given)).setup()
 
 
 def test_training_frames_can_be_chosen_by_a_list(tmp_path):
@@ -131,29 +131,29 @@ def test_training_frames_can_be_chosen_by_a_list(tmp_path):
     listed = tmp_path / "list.txt"
     listed.write_text("# chosen\n0001.png\n0004\n\n0005.png\n")
     assert read_frame_list(listed) == ["0001.png", "0004", "0005.png"]
-    data = FrameDataModule([str(sequence)], frames=str(listed), size=(40, 32))
+    data = FrameDataModule(FrameData([str(sequence)], frames=str(listed), size=(40, 32)))
     data.setup()
     assert data.counts == {"train": 2, "val": 1}
     listed.write_text("0999.png\n")
     with pytest.raises(InputError, match="none of the 1 listed"):
-        FrameDataModule([str(sequence)], frames=str(listed)).setup()
+        FrameDataModule(FrameData([str(sequence)], frames=str(listed))).setup()
     with pytest.raises(InputError, match="cannot be read"):
-        FrameDataModule([str(sequence)], frames=str(tmp_path / "no.txt")).setup()
+        FrameDataModule(FrameData([str(sequence)], frames=str(tmp_path / "no.txt"))).setup()
 
 
 def test_the_last_tenth_of_a_sequence_is_held_out_unless_there_are_validation_sequences(tmp_path):
     sequence, other = (str(write_sequence(tmp_path / name, 20)) for name in ("seq", "other"))
     for val_sequences, counts in (([], {"train": 18, "val": 2}), ([other], {"train": 20, "val": 20})):
-        data = FrameDataModule([sequence], val_sequences, size=(40, 32))
+        data = FrameDataModule(FrameData([sequence], val_sequences, size=(40, 32)))
         data.setup()
         assert data.counts == counts
 
 
 def test_nothing_to_train_on_is_said():
     with pytest.raises(InputError, match=r"data\.sequences"):
-        FrameDataModule().setup()
+        FrameDataModule(FrameData()).setup()
     with pytest.raises(InputError, match="val_scenes"):
-        FrameDataModule(tube=TubeData(scenes=1, frames=1), size=(20, 16)).setup()
+        FrameDataModule(FrameData(tube=TubeData(scenes=1, frames=1), size=(20, 16))).setup()
 
 
 def test_training_steps_lower_the_loss():

@@ -29,6 +29,7 @@ def train(argv: list[str] | None = None) -> int:
     """
     import lightning.pytorch as pl
 
+    from .datamodule import FrameDataModule
     from .fit import check_output, fit
 
     given = list(sys.argv[1:] if argv is None else argv)
@@ -41,7 +42,7 @@ def train(argv: list[str] | None = None) -> int:
     made = parser.instantiate(config)
     text = as_yaml(parser, config)
     flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given, "settings": made.fit}
-    fit(made.model, made.data, output, vars(made.trainer), text, config.seed, **flags)
+    fit(made.model, FrameDataModule(made.data), output, vars(made.trainer), text, config.seed, **flags)
     return 0
 
 
@@ -52,7 +53,7 @@ def training_parser() -> ArgumentParser:
 
     from lightdepth.module import LightDepth
 
-    from .datamodule import FrameDataModule
+    from .datamodule import FrameData
     from .fit import FitConfig
 
     parser = ArgumentParser(
@@ -66,7 +67,7 @@ def training_parser() -> ArgumentParser:
     parser.add_argument("--overwrite", action="store_true", help="replace a run that is already there")
     parser.add_argument("--seed", type=int, default=0, help="of weights, colons, order and augmentation")
     parser.add_class_arguments(LightDepth, "model")
-    parser.add_class_arguments(FrameDataModule, "data")
+    parser.add_class_arguments(FrameData, "data")
     parser.add_class_arguments(FitConfig, "fit")
     parser.add_class_arguments(pl.Trainer, "trainer", instantiate=False, skip={"default_root_dir"})
     parser.link_arguments("seed", "data.seed")

@@ -7,14 +7,14 @@ resumed run sees what an uninterrupted one would have seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
-from lightdepth.datasets import FrameSequence
+from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.splits import check_apart, folders, read_split
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, flipped, to_batch
@@ -22,85 +22,91 @@ from lightdepth.losses import LossConfig
 from lightdepth.photometry import LightTerms, brightness, decode, encode
 from lightdepth.reporting.progress import Progress
 from train.colons import TubeData, colon_seeds, tube_scene, with_reflectance
-from train.frame_lists import Listed, Reading, listed_rows, open_listed
+from train.frame_lists import Listed, listed_rows, open_listed
 from train.order import Halves, Shuffled
 
 _NO_TUBE = TubeData()
 _WHITE = LossConfig().white
 
 
-class FrameDataModule(pl.LightningDataModule):
-    """Training and validation frames, as FrameBatches of one size.
+@dataclass(frozen=True)
+class FrameData:
+    """Which frames are trained and validated on, and how they are shown to the network."""
 
-    Args:
-        sequences: folders to train on.
-        val_sequences: folders to validate on; without any, the end of each training sequence is held out.
-        split: a split file (data/*/splits/*.yaml) in place of both; its train and val are read, its test never is.
-        root: the folder that holds the split's sequences.
-        frames: a file with one frame name a line, as `select` writes it; training takes exactly these, and what is held
-            out to validate on comes from them. `folder/name` where several sequences have frames of one name.
-        format: of the sequences: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if
-            left out.
-        camera: calibration file of all the sequences, which wins over their own.
-        light: light.json, photometric XML, or gamma=2.2,mu=0, likewise.
-        mask: image, white where tissue shows, likewise.
-        held_out: share of each training sequence, at its end, to validate on where there are no validation sequences.
-        tube: synthetic colons.
-        halves: every batch holds frames of the sequences first, then as many (or one less) of the synthetic colons.
-        size: width and height of the images, pixels.
-        batch_size: frames in a step.
-        num_workers: processes that read frames.
-        augment: exposure and flips.
-        reflectance_error: added to what is known of each wall's reflectance: what a wrong calibration costs.
-        random_reflectance: ends of a range from which each image's reflectance is drawn anew at every step, whatever is
-            known of it: for networks that have it as an input and are to obey it.
-        seed: of colons, order and augmentation.
-    """
+    sequences: list[str] | None = None
+    """folders of frames to train on"""
+    val_sequences: list[str] | None = None
+    """folders to validate on; without any, the end of each training sequence is held out"""
+    split: str | None = None
+    """split file (data/*/splits/*.yaml) in place of both; its train and val are read, its test never is"""
+    root: str | None = None
+    """folder that holds the split's sequences"""
+    frames: str | None = None
+    """file with one frame name a line, as `select` writes it; training takes exactly these, and what is held out to
+    validate on comes from them. `folder/name` where several sequences have frames of one name"""
+    format: str | None = None
+    """format of the sequences: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if
+    left out"""
+    camera: str | None = None
+    """calibration file of all the sequences, which wins over their own"""
+    light: str | None = None
+    """light.json, photometric XML, or gamma=2.2,mu=0, of all the sequences, which wins over their own"""
+    mask: str | None = None
+    """image, white where tissue shows, of all the sequences, which wins over their own"""
+    held_out: float = 0.1
+    """share of each training sequence, at its end, to validate on where there are no validation sequences"""
+    tube: TubeData = _NO_TUBE
+    """synthetic colons to train on, besides the sequences or alone"""
+    halves: bool = False
+    """every batch holds frames of the sequences first, then as many (or one less) of the synthetic colons"""
+    size: tuple[int, int] = (160, 128)
+    """width and height of the images, pixels"""
+    batch_size: int = 4
+    """number of frames in a step"""
+    num_workers: int = 0
+    """number of processes that read frames"""
+    augment: bool = True
+    """draw exposure and flips anew at every step"""
+    reflectance_error: float = 0.0
+    """added to what is known of each wall's reflectance: what a wrong calibration costs"""
+    random_reflectance: tuple[float, float] | None = None
+    """ends of a range from which each image's reflectance is drawn anew at every step, whatever is known of it: for
+    networks that have it as an input and are to obey it"""
+    seed: int = 0
+    """number that draws colons, order and augmentation"""
 
-    def __init__(
-        self,
-        sequences: list[str] | None = None,
-        val_sequences: list[str] | None = None,
-        split: str | None = None,
-        root: str | None = None,
-        frames: str | None = None,
-        format: str | None = None,
-        camera: str | None = None,
-        light: str | None = None,
-        mask: str | None = None,
-        held_out: float = 0.1,
-        tube: TubeData = _NO_TUBE,
-        halves: bool = False,
-        size: tuple[int, int] = (160, 128),
-        batch_size: int = 4,
-        num_workers: int = 0,
-        augment: bool = True,
-        reflectance_error: float = 0.0,
-        random_reflectance: tuple[float, float] | None = None,
-        seed: int = 0,
-    ) -> None:
-        super().__init__()
-        self.sequences, self.val_sequences = sequences or [], val_sequences or []
-        self.split, self.root = split, root
-        self.reading = Reading(format, camera, light, mask)
-        self.frames, self.tube, self.seed = frames, tube, seed
-        self.size, self.batch_size, self.num_workers = (int(size[0]), int(size[1])), batch_size, num_workers
-        self.augment, self.held_out, self.halves = augment, held_out, halves
-        self.reflectance_error, self.random_reflectance = reflectance_error, random_reflectance
-        if random_reflectance is not None and not 0 <= random_reflectance[0] <= random_reflectance[1] < 1:
-            raise InputError(f"data: random_reflectance {random_reflectance}; expected 0 <= low <= high < 1")
-        if not 0 < held_out < 1:
-            raise InputError(f"data: held_out {held_out}; expected a share above 0 and below 1")
-        if halves and batch_size < 2:
+    def __post_init__(self) -> None:
+        if self.random_reflectance is not None:
+            low, high = self.random_reflectance
+            if not 0 <= low <= high < 1:
+                raise InputError(f"data: random_reflectance {self.random_reflectance}; expected 0 <= low <= high < 1")
+        if not 0 < self.held_out < 1:
+            raise InputError(f"data: held_out {self.held_out}; expected a share above 0 and below 1")
+        if self.halves and self.batch_size < 2:
             raise InputError("data: halves of a batch of one; expected a batch_size of at least 2")
-        if min(*self.size, batch_size) < 1:
-            raise InputError(f"data: size {self.size}, batch_size {batch_size}; expected positive numbers")
-        if split is not None and (self.sequences or self.val_sequences):
+        if min(*self.size, self.batch_size) < 1:
+            raise InputError(f"data: size {self.size}, batch_size {self.batch_size}; expected positive numbers")
+        if self.split is not None and (self.sequences or self.val_sequences):
             raise InputError("data: a split and sequences; give --data.split FILE or --data.sequences, not both")
-        if (split is None) != (root is None):
+        if (self.split is None) != (self.root is None):
             raise InputError(
                 "data: a split and the root of its sequences go together: --data.split FILE --data.root DIR"
             )
+
+    def source(self, path: str, format: str | None = None) -> SequenceSource:
+        """How the sequence at `path` is read; `format` is that of its data set, where it is known."""
+        camera, mask = (None if file is None else Path(file) for file in (self.camera, self.mask))
+        return SequenceSource(Path(path), self.format or format, camera, self.light, mask)
+
+
+class FrameDataModule(pl.LightningDataModule):
+    """Training and validation frames, as FrameBatches of one size. Raises InputError where a sequence is in both."""
+
+    def __init__(self, config: FrameData) -> None:
+        super().__init__()
+        self.config, self.tube, self.split = config, config.tube, config.split
+        self.sequences, self.val_sequences = config.sequences or [], config.val_sequences or []
+        self.size, self.batch_size = (int(config.size[0]), int(config.size[1])), config.batch_size
         check_apart(self.sequences, self.val_sequences)
         self._train: ConcatDataset | None = None
         self._val: ConcatDataset | None = None
@@ -111,27 +117,29 @@ class FrameDataModule(pl.LightningDataModule):
         train: list[Dataset] = []
         val: list[Dataset] = []
         to_train, to_validate = self._folders()
-        opened = [(path, open_listed(path, of, self.reading)) for path, of in to_train]
+        opened = [(path, open_listed(self.config.source, path, of)) for path, of in to_train]
         rows = [list(range(len(frames))) for _, frames in opened]
-        if self.frames is not None:
+        if self.config.frames is not None:
             if len(dict(opened)) < len(opened):
                 raise InputError(f"{self.split}: has one sequence twice in train; --data.frames cannot tell them apart")
-            rows = list(listed_rows(Path(self.frames), dict(opened)).values())
+            rows = list(listed_rows(Path(self.config.frames), dict(opened)).values())
         for (path, frames), listed in zip(opened, rows, strict=True):
             if not listed:
-                raise InputError(f"{path}: none of its frames is listed in {self.frames}; leave it out, or list some")
+                raise InputError(
+                    f"{path}: none of its frames is listed in {self.config.frames}; leave it out, or list some"
+                )
             chosen = frames.at(listed)
-            held_out = 0 if to_validate else held_out_count(len(chosen), self.held_out)
+            held_out = 0 if to_validate else held_out_count(len(chosen), self.config.held_out)
             if len(chosen) <= held_out:
                 raise InputError(f"{path}: {len(chosen)} frame; expected at least two, one of them to validate on")
             train.append(_Frames(chosen[: len(chosen) - held_out], self.size, path))
             if held_out:
                 val.append(_Frames(chosen[-held_out:], self.size, path))
         for path, of in to_validate:
-            val.append(_Frames(open_listed(path, of, self.reading), self.size, path))
+            val.append(_Frames(open_listed(self.config.source, path, of), self.size, path))
         if self.tube.scenes + self.tube.val_scenes > 0:
             with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
-                to_train_on, to_validate_on = colon_seeds(self.tube, self.seed)
+                to_train_on, to_validate_on = colon_seeds(self.tube, self.config.seed)
                 train += self._colons(to_train_on, bar)
                 val += self._colons(to_validate_on, bar)
         if not train:
@@ -147,10 +155,11 @@ class FrameDataModule(pl.LightningDataModule):
         self._train, self._val = other._train, other._val
         return True
 
-    def _origin(self) -> tuple[Any, ...]:
+    def _origin(self) -> tuple[object, ...]:
         """What the frames follow from."""
-        read = (self.sequences, self.val_sequences, self.split, self.root, self.frames, self.reading, self.held_out)
-        return (*read, self.tube, self.size, self.seed)
+        c = self.config
+        read = (c.split, c.root, c.frames, c.format, c.camera, c.light, c.mask, c.held_out)
+        return (self.sequences, self.val_sequences, *read, c.tube, self.size, c.seed)
 
     def _folders(self) -> list[list[tuple[str, Listed | None]]]:
         """The folders to train and to validate on, with what a split says of each; a split's become the sequences."""
@@ -159,8 +168,8 @@ class FrameDataModule(pl.LightningDataModule):
         split = read_split(Path(self.split))
         if "train" not in split.parts:
             raise InputError(f"{self.split}: no train in it; it is a split to test with, not to train with")
-        assert self.root is not None
-        found = folders(split, Path(self.root), ("train", "val"))
+        assert self.config.root is not None
+        found = folders(split, Path(self.config.root), ("train", "val"))
         both: list[list[tuple[str, Listed | None]]] = [
             [(str(folder), Listed(split, chosen)) for folder, chosen in found.get(part, [])]
             for part in ("train", "val")
@@ -195,45 +204,46 @@ class FrameDataModule(pl.LightningDataModule):
         assert self._train is not None
         colons = sum(len(part) for part in self._train.datasets if isinstance(part, _Cached))  # type: ignore[arg-type]
         frames = len(self._train) - colons
-        if self.halves and frames and colons:
-            return Halves(frames, colons, self.batch_size, self.seed)
-        return Shuffled(len(self._train), self.seed)
+        if self.config.halves and frames and colons:
+            return Halves(frames, colons, self.batch_size, self.config.seed)
+        return Shuffled(len(self._train), self.config.seed)
 
     def train_dataloader(self) -> DataLoader:
         assert self._train is not None
         sampler = self._order()
         full = len(self._train) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
-        return self._loader(self._train, sampler=sampler, drop_last=full)
+        return self._loader(self._train, sampler, drop_last=full)
 
     def val_dataloader(self) -> DataLoader:
         assert self._val is not None
-        return self._loader(self._val, shuffle=False)
+        return self._loader(self._val)
 
     def on_after_batch_transfer(self, batch: FrameBatch, dataloader_idx: int) -> FrameBatch:
-        if self.reflectance_error:
-            batch = with_reflectance(batch, batch.light.reflectance + self.reflectance_error)
+        if self.config.reflectance_error:
+            batch = with_reflectance(batch, batch.light.reflectance + self.config.reflectance_error)
         trainer = self.trainer
         if trainer is None or not trainer.training:
             return batch
         # Every process of a distributed run augments in its own way.
-        seed = self.seed * 1_000_003 + trainer.global_step + trainer.global_rank * 1_000_000_007
+        seed = self.config.seed * 1_000_003 + trainer.global_step + trainer.global_rank * 1_000_000_007
         generator = torch.Generator().manual_seed(seed)
-        if self.augment:
+        if self.config.augment:
             batch = augmented(batch, generator)
-        if self.random_reflectance is not None:
-            low, high = self.random_reflectance
+        if self.config.random_reflectance is not None:
+            low, high = self.config.random_reflectance
             drawn = low + (high - low) * torch.rand(len(batch.image), 1, 1, 1, generator=generator)
             batch = with_reflectance(batch, drawn.to(batch.image.device))
         return batch
 
-    def _loader(self, dataset: Dataset, **options: Any) -> DataLoader:
+    def _loader(self, dataset: Dataset, order: Shuffled | None = None, drop_last: bool = False) -> DataLoader:
         return DataLoader(
             dataset,
+            sampler=order,
+            drop_last=drop_last,
             batch_size=self.batch_size,
-            num_workers=self.num_workers,
-            persistent_workers=self.num_workers > 0,
+            num_workers=self.config.num_workers,
+            persistent_workers=self.config.num_workers > 0,
             collate_fn=collate,
-            **options,
         )
 
 

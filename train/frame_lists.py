@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from lightdepth.datasets import FrameSequence, open_sequence
+from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.splits import Chosen, Split
 from lightdepth.errors import InputError
 
@@ -32,24 +32,12 @@ class Listed:
     chosen: Chosen
 
 
-@dataclass(frozen=True)
-class Reading:
-    """How sequences are read: what is given wins over what is in their folders."""
-
-    format: str | None = None
-    camera: str | None = None
-    light: str | None = None
-    mask: str | None = None
-
-    def open(self, path: str, format: str | None = None) -> FrameSequence:
-        return open_sequence(path, self.format or format, self.camera, self.light, self.mask)
-
-
-def open_listed(path: str, of: Listed | None, reading: Reading) -> FrameSequence:
+def open_listed(source: Callable[..., SequenceSource], path: str, of: Listed | None) -> FrameSequence:
+    """The frames of a sequence, or those of them that a split lists; `source(path, format)` says how it is read."""
     if of is None:
-        return reading.open(path)
+        return source(path).open()
     info, expected = of.split.info, of.split.frame_count(of.chosen.name)
-    frames = reading.open(path, None if info is None else info.format)
+    frames = source(path, None if info is None else info.format).open()
     if expected is not None and len(frames) != expected:
         warnings.warn(f"{path}: {len(frames)} frames; the data set has {expected}. Is it there whole?", stacklevel=2)
     rows = [i for i, number in enumerate(frames.numbers) if of.chosen.takes(number)]

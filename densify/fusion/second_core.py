@@ -11,21 +11,21 @@ import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
-from typing import ParamSpec, TypeVar
+from typing import TypeVar, TypeVarTuple, Unpack
 
 import numba
 
-P = ParamSpec("P")
+Arguments = TypeVarTuple("Arguments")
 R = TypeVar("R")
 
 
-def later(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+def later(function: Callable[[Unpack[Arguments]], R], *args: *Arguments) -> Future[R]:
     """Begins a piece of work in the background; on one core, does it. It may not itself ask for the second core."""
     helper = _helper()
     if helper is not None:
-        return helper.submit(function, *args, **kwargs)
+        return helper.submit(function, *args)
     done: Future[R] = Future()
-    done.set_result(function(*args, **kwargs))
+    done.set_result(function(*args))
     return done
 
 

@@ -42,7 +42,7 @@ from lightdepth.models import NetworkModel
 from lightdepth.module import MIN_RAY_Z
 from lightdepth.network import DepthNetwork
 from lightdepth.reporting.progress import Progress
-from lightdepth.reporting.run import plain, write_run_json
+from lightdepth.reporting.run import plain, recorded, write_run_json
 from lightdepth.tube.variant import REFLECTANCE, variant_frames
 
 from ..cli import as_yaml, training_parser
@@ -150,7 +150,10 @@ def ablate(
         table: Markdown file to write a copy of the table to
         overwrite: make all rows anew
     """
-    started, arguments = time.time(), {k: v for k, v in locals().items() if k != "overwrite"}
+    started = time.time()
+    arguments = recorded(
+        output=output, base=base, settings=settings, rows=rows, judged=judged, seeds=seeds, table=table
+    )
     _check(output, rows, judged, seeds)
     parser = training_parser()
     parser.exit_on_error = False
@@ -300,9 +303,10 @@ def _trained(parser: ArgumentParser, plan: _Plan, judge: Judge, rendered: list[F
     folder = Path(plan.config.output)
     pl.seed_everything(plan.seed, workers=True, verbose=False)
     made = parser.instantiate(plan.config)
-    if not any(made.data.share(other) for other in rendered):
-        made.data.setup()
-        rendered.append(made.data)
+    data = FrameDataModule(made.data)
+    if not any(data.share(other) for other in rendered):
+        data.setup()
+        rendered.append(data)
     curve, started = _Curve(), time.monotonic()
     options = {**vars(made.trainer), "logger": False, "callbacks": [curve], "enable_progress_bar": False}
     text = as_yaml(parser, plan.config)
@@ -310,7 +314,7 @@ def _trained(parser: ArgumentParser, plan: _Plan, judge: Judge, rendered: list[F
     failed, errors = "", dict[str, dict[str, dict[str, float]]]()
     try:
         with contextlib.redirect_stderr(io.StringIO()):  # its own log.txt has it
-            fit(made.model, made.data, folder, options, text, plan.seed, overwrite=True, settings=made.fit)
+            fit(made.model, data, folder, options, text, plan.seed, overwrite=True, settings=made.fit)
         model = load_model(folder / "model.safetensors", details=False)
         assert isinstance(model, NetworkModel)
         model.to("cpu")  # where the colons to judge on are

@@ -39,7 +39,7 @@ from ..adapting.config import AdaptConfig
 from ..adapting.map_teacher import MapTeacher
 from ..adapting.module import Adaptation, merge, source_colons, target_loss
 from ..callbacks import Diagnosis, DiagnosisConfig, Progress
-from ..datamodule import FrameDataModule, held_out_count
+from ..datamodule import FrameData, FrameDataModule, held_out_count
 from ..running import card_text, quiet, report_every
 
 _LEAST_VIEWS = 3  # held-out keyframes below which the map's other keyframes judge too
@@ -153,17 +153,19 @@ def adapt(
         size = config.size or working_size(frames[0].camera, start.rows)
         sequences = [str(path) for path in (source.data, *more)]
         module_data = FrameDataModule(
-            sequences,
-            format=source.format,
-            camera=None if source.camera is None else str(source.camera),
-            light=source.light,
-            mask=None if source.mask is None else str(source.mask),
-            held_out=config.held_out,
-            tube=source_colons(start.card, config.replay),
-            halves=config.replay > 0,
-            size=size,
-            batch_size=config.batch_size,
-            seed=config.seed,
+            FrameData(
+                sequences,
+                format=source.format,
+                camera=None if source.camera is None else str(source.camera),
+                light=source.light,
+                mask=None if source.mask is None else str(source.mask),
+                held_out=config.held_out,
+                tube=source_colons(start.card, config.replay),
+                halves=config.replay > 0,
+                size=size,
+                batch_size=config.batch_size,
+                seed=config.seed,
+            )
         )
         module_data.setup()
         counts = module_data.counts

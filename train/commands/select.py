@@ -10,7 +10,7 @@ import io
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, astuple, fields
+from dataclasses import asdict, astuple, dataclass, field, fields
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +19,7 @@ import numpy as np
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.maps import read_map
+from lightdepth.options import Group
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.report import Report
@@ -39,6 +40,22 @@ from ..selecting.matching import LoftrMatcher, LoftrSettings, Matcher, Orientati
 _SHOWN = 48  # pictures of kept and of rejected frames each
 
 
+@dataclass(frozen=True)
+class SelectConfig:
+    """What is covisible and what is kept, by each way of telling."""
+
+    sift: SiftSettings = field(default_factory=SiftSettings)
+    """features of the sift matcher"""
+    sift_nodes: NodeRules = SIFT_NODES
+    """what is covisible and what is kept, with the sift matcher"""
+    loftr: LoftrSettings = field(default_factory=LoftrSettings)
+    """weights and thresholds of the loftr matcher"""
+    loftr_nodes: NodeRules = LOFTR_NODES
+    """what is covisible and what is kept, with the loftr matcher"""
+    map_rules: MapRules = field(default_factory=MapRules)
+    """what is kept, with --map"""
+
+
 def select(
     data: Path,
     output: Path,
@@ -47,11 +64,7 @@ def select(
     format: str | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
-    sift: SiftSettings = SiftSettings(),
-    sift_nodes: NodeRules = SIFT_NODES,
-    loftr: LoftrSettings = LoftrSettings(),
-    loftr_nodes: NodeRules = LOFTR_NODES,
-    map_rules: MapRules = MapRules(),
+    config: Group[SelectConfig] = SelectConfig(),
     with_folder: bool = False,
     no_frames: bool = False,
     overwrite: bool = False,
@@ -66,11 +79,6 @@ def select(
         format: folder, c3vd, simcol, hamlyn or endomapper; found by looking when left out
         camera: calibration file that wins over the folder's
         mask: image, white where tissue shows
-        sift: features of the sift matcher
-        sift_nodes: what is covisible and what is kept, with the sift matcher
-        loftr: the loftr matcher
-        loftr_nodes: what is covisible and what is kept, with the loftr matcher
-        map_rules: what is kept, with --map
         with_folder: write names as folder/name, so that lists of several sequences can be joined
         no_frames: leave the pictures out
         overwrite: replace files made before
@@ -81,12 +89,12 @@ def select(
     frames = SequenceSource(data, format, camera, mask=mask).open(map_camera)
     settings: dict[str, object]
     if sparse_map is not None and map is not None:
-        verdicts, how = _by_map(frames, sparse_map, map, map_rules)
-        settings = {"map": str(map), **asdict(map_rules)}
+        verdicts, how = _by_map(frames, sparse_map, map, config.map_rules)
+        settings = {"map": str(map), **asdict(config.map_rules)}
     else:
-        used: Matcher = SiftMatcher(sift) if matcher == "sift" else LoftrMatcher(loftr)
-        nodes = sift_nodes if matcher == "sift" else loftr_nodes
-        settings = {"matcher": matcher, **asdict(nodes), **asdict(sift if matcher == "sift" else loftr)}
+        used: Matcher = SiftMatcher(config.sift) if matcher == "sift" else LoftrMatcher(config.loftr)
+        nodes = config.sift_nodes if matcher == "sift" else config.loftr_nodes
+        settings = {"matcher": matcher, **asdict(nodes), **asdict(config.sift if matcher == "sift" else config.loftr)}
         how = f"frames matched with {matcher}"
         with Progress("Selecting", len(frames)) as bar:
             verdicts = select_by_matching(frames, frames.names, OrientationDescriptor(), used, nodes, bar.advance)
