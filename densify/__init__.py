@@ -1,23 +1,42 @@
-"""densify: depth and a sparse map in, dense maps out."""
+"""densify: depth and a sparse map in, dense maps out.
 
-from __future__ import annotations
+The public names are those of `__all__`; docs/api.md shows each at work.
+"""
 
-from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING
+
+from lightdepth import __version__ as __version__
+from lightdepth.lazy import public
+
+if TYPE_CHECKING:
+    from densify.alignment import Alignment as Alignment
+    from densify.config import DensifyConfig as DensifyConfig
+    from densify.config import LiveConfig as LiveConfig
+    from densify.dense_map import DenseMap as DenseMap
+    from densify.dense_map import read_dense_map as read_dense_map
+    from densify.evaluation.errors import compare_depth as compare_depth
+    from densify.evaluation.errors import surface_errors as surface_errors
+    from densify.evaluation.trajectory import align_trajectory as align_trajectory
+    from densify.fusion.volume import TsdfVolume as TsdfVolume
+    from densify.live.densifier import Densifier as Densifier
+    from densify.pipeline import densify as densify
+    from densify.similarity import Similarity as Similarity
+    from densify.similarity import fit_similarity as fit_similarity
 
 _HOMES = {
-    "densify": "densify.pipeline",
-    "DensifyConfig": "densify.config",
-    "DenseMap": "densify.dense_map",
     "Alignment": "densify.alignment",
-    "TsdfVolume": "densify.fusion.volume",
+    "DenseMap": "densify.dense_map",
     "Densifier": "densify.live.densifier",
+    "DensifyConfig": "densify.config",
+    "LiveConfig": "densify.config",
+    "Similarity": "densify.similarity",
+    "TsdfVolume": "densify.fusion.volume",
+    "align_trajectory": "densify.evaluation.trajectory",
+    "compare_depth": "densify.evaluation.errors",
+    "densify": "densify.pipeline",
+    "fit_similarity": "densify.similarity",
+    "read_dense_map": "densify.dense_map",
+    "surface_errors": "densify.evaluation.errors",
 }
 __all__ = list(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    # Lazy: the command line imports this package to answer --help.
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
-    raise AttributeError(f"module 'densify' has no attribute {name!r}")
+__getattr__, __dir__ = public(__name__, _HOMES)

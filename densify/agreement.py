@@ -28,6 +28,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from densify.bending import Bend, BendingConfig
+from lightdepth.brief import Brief
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
 from lightdepth.robust import lower_quartile, mad_sigma, robust_weights
@@ -50,8 +51,8 @@ class AgreementConfig:
     max_gap: float = 0.5  # overlap residuals beyond are of other tissue: occlusion
 
 
-@dataclass(frozen=True)
-class View:
+@dataclass(frozen=True, repr=False)
+class View(Brief):
     """A keyframe as the agreement sees it: what it observed, its log predicted distance at few rows (h, w) float32
     with validity (h, w), and its LMedS scale."""
 

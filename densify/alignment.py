@@ -15,6 +15,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from densify.bending import Bend
+from lightdepth.brief import Brief
 from lightdepth.errors import InputError
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
@@ -49,8 +50,8 @@ class AlignmentConfig:
             raise InputError(f"alignment.t {self.t}; expected a positive number of sigmas, such as 2.5")
 
 
-@dataclass(frozen=True)
-class Alignment:
+@dataclass(frozen=True, repr=False)
+class Alignment(Brief):
     """map distance ≈ scale · predicted distance. sigma in map units; ids of the points on either side of t sigma.
 
     `ok`, or else `reason` says why the keyframe is left out. `range_90` is the 90th percentile of the distance of the

@@ -17,6 +17,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from lightdepth.brief import Brief
 from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
 
@@ -49,8 +50,8 @@ class BendingConfig:
         return np.concatenate([[0.0], slope, *bumps])
 
 
-@dataclass(frozen=True)
-class Bend:
+@dataclass(frozen=True, repr=False)
+class Bend(Brief):
     """The field of one keyframe: `weights` w (m,), `log_middle` log b0, image_size (width, height)."""
 
     config: BendingConfig

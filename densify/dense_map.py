@@ -14,6 +14,7 @@ import numpy as np
 from densify.alignment import Alignment
 from densify.fusion.volume import TsdfVolume
 from lightdepth import native
+from lightdepth.brief import Brief
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
@@ -74,8 +75,8 @@ class Contribution:
     views: float = np.nan
 
 
-@dataclass(frozen=True)
-class DenseMap:
+@dataclass(frozen=True, repr=False)
+class DenseMap(Brief):
     """vertices (n, 3) and triangles (m, 3) in `unit` ("map units" or "mm"), colors (n, 3) in [0, 1]; the alignments,
     one for each keyframe of the submap, in order. `voxel` is the size of the fusion's voxels in the same unit.
 
@@ -133,11 +134,14 @@ class DenseMap:
             np.add.at(votes[side], self.submap.rows_of(ids)[0], 1)
         return votes.sum(0) > 0, votes[0] > votes[1]
 
-    def write(self, folder: Path, formats: tuple[str, ...] = ("ply",), mm_per_unit: float | None = None) -> None:
+    def write(self, folder: str | Path, formats: tuple[str, ...] = ("ply",), mm_per_unit: float | None = None) -> None:
         """mesh.*, cloud.ply, sparse.ply, keyframes.csv, trajectory.tum, camera.json; trajectory times are frame
-        numbers. With mm_per_unit, lengths are written in mm."""
+        numbers. With mm_per_unit, lengths are written in mm. `folder` is made; raises InputError where it is there."""
         import trimesh
 
+        folder = Path(folder)
+        if folder.exists():
+            raise InputError(f"{folder}: already there; choose another folder")
         folder.mkdir(parents=True)
         scale = mm_per_unit or 1.0
         rgba = np.concatenate([np.rint(self.colors * 255), np.full((len(self.colors), 1), 255)], 1).astype(np.uint8)
@@ -194,8 +198,8 @@ def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.
     path.write_bytes("\n".join(header).encode() + rows.tobytes())
 
 
-@dataclass(frozen=True)
-class DenseMapFiles:
+@dataclass(frozen=True, repr=False)
+class DenseMapFiles(Brief):
     """A dense map read back from its folder: the surface, the sparse points with their colours, the keyframes' frame
     numbers and poses map_from_cam (n, 4, 4), and the map's camera; confidence and views of each vertex, where the file
     has them."""
@@ -225,8 +229,9 @@ def run_record(path: Path) -> dict[str, Any]:
     return read_json(folder / "run.json") if (folder / "run.json").is_file() else {}
 
 
-def read_dense_map(folder: Path) -> DenseMapFiles:
+def read_dense_map(folder: str | Path) -> DenseMapFiles:
     """What DenseMap.write wrote. Raises InputError when it is not all there."""
+    folder = Path(folder)
     for name in ("mesh.ply", "sparse.ply", "trajectory.tum", "camera.json"):
         if not (folder / name).is_file():
             raise InputError(f"{folder}: {name} missing; expected a map folder of a `lightdepth densify` run")

@@ -15,13 +15,14 @@ from densify.dense_map import DenseMap
 from densify.evaluation.withheld import Withheld
 from densify.fusers import fuser_for
 from densify.predictions import Clock, Predictions, Predictor, Seen
+from lightdepth.brief import Brief
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.sparse_map import SparseMap, Submap, covisibility
 
 
-@dataclass(frozen=True)
-class SubmapResult:
+@dataclass(frozen=True, repr=False)
+class SubmapResult(Brief):
     """The dense map of one submap, and what is known of it without truth."""
 
     dense: DenseMap

@@ -1,25 +1,43 @@
-"""lightdepth: depth of endoscope images from the decline of their light, and what is read from disk for it."""
+"""lightdepth: depth of endoscope images from the decline of their light, and what is read from disk for it.
 
-from __future__ import annotations
+The public names are those of `__all__`; docs/api.md shows each at work.
+"""
 
-from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING
+
+from lightdepth.lazy import public
+
+if TYPE_CHECKING:
+    from lightdepth.camera import CameraModel as CameraModel
+    from lightdepth.checkpoint import load_model as load_model
+    from lightdepth.datasets import FrameSequence as FrameSequence
+    from lightdepth.datasets import open_sequence as open_sequence
+    from lightdepth.errors import InputError as InputError
+    from lightdepth.frame import Frame as Frame
+    from lightdepth.maps import read_map as read_map
+    from lightdepth.models import DepthModel as DepthModel
+    from lightdepth.models import predict as predict
+    from lightdepth.photometry import PhotometricCalibration as PhotometricCalibration
+    from lightdepth.prediction import DepthPrediction as DepthPrediction
+    from lightdepth.prediction import read_prediction as read_prediction
+    from lightdepth.sparse_map import SparseMap as SparseMap
+
+__version__ = "0.1.0"
 
 _HOMES = {
-    "open_sequence": "lightdepth.datasets",
-    "read_map": "lightdepth.maps",
-    "load_model": "lightdepth.checkpoint",
-    "predict": "lightdepth.models",
-    "Frame": "lightdepth.frame",
+    "CameraModel": "lightdepth.camera",
+    "DepthModel": "lightdepth.models",
     "DepthPrediction": "lightdepth.prediction",
-    "SparseMap": "lightdepth.sparse_map",
+    "Frame": "lightdepth.frame",
+    "FrameSequence": "lightdepth.datasets",
+    "InputError": "lightdepth.errors",
     "PhotometricCalibration": "lightdepth.photometry",
+    "SparseMap": "lightdepth.sparse_map",
+    "load_model": "lightdepth.checkpoint",
+    "open_sequence": "lightdepth.datasets",
+    "predict": "lightdepth.models",
+    "read_map": "lightdepth.maps",
+    "read_prediction": "lightdepth.prediction",
 }
 __all__ = list(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    # Lazy: the command line imports this package to answer --help.
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
-    raise AttributeError(f"module 'lightdepth' has no attribute {name!r}")
+__getattr__, __dir__ = public(__name__, _HOMES)

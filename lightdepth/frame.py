@@ -12,6 +12,7 @@ import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
+from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.photometry import LightTerms, PhotometricCalibration
@@ -30,8 +31,8 @@ def frame_number(name: str) -> int:
     return int(digits[-1])
 
 
-@dataclass(frozen=True)
-class Frame:
+@dataclass(frozen=True, repr=False)
+class Frame(Brief):
     """One calibrated image and the truth about it, where there is any.
 
     image (H, W, 3) float32 RGB in [0, 1] as the camera encoded it; mask (H, W) bool, True where the image shows tissue;

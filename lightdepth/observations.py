@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lightdepth.brief import Brief
 from lightdepth.frame import check_image_size
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Keyframe, Submap
 
 
-@dataclass(frozen=True)
-class ObservedDistances:
+@dataclass(frozen=True, repr=False)
+class ObservedDistances(Brief):
     """For each usable point that a keyframe observed: its id, distance from the camera in map units (mapped), the
     predicted distance on the same ray (predicted), the pixel (n, 2) of that ray, and the ray (n, 3) in camera axes."""
 

@@ -11,14 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.errors import InputError
 
 _UNREADABLE = (OSError, EOFError, KeyError, ValueError, TypeError, AssertionError, zipfile.BadZipFile, zlib.error)
 
 
-@dataclass(frozen=True)
-class DepthPrediction:
+@dataclass(frozen=True, repr=False)
+class DepthPrediction(Brief):
     """Distance along the ray at every pixel of a frame, up to one scale per frame.
 
     distance (H, W) float32 > 0 where valid (H, W) bool; albedo (H, W, 3) and normals (H, W, 3) float32 or None;
@@ -45,7 +46,7 @@ class DepthPrediction:
         """The prediction with its distance multiplied by `scale`."""
         return replace(self, distance=self.distance * np.float32(scale))
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """One compressed .npz, with unit, camera and provenance in `meta`."""
         camera = {
             "model": self.camera.name,
@@ -63,7 +64,7 @@ class DepthPrediction:
         np.savez_compressed(path, meta=np.array(json.dumps(meta)), **arrays)
 
 
-def read_prediction(path: Path) -> DepthPrediction:
+def read_prediction(path: str | Path) -> DepthPrediction:
     """A prediction from its .npz. Raises InputError when it is not one."""
     try:
         with np.load(path, allow_pickle=False) as data:

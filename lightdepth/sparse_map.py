@@ -13,13 +13,14 @@ from functools import cached_property
 
 import numpy as np
 
+from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.frame import frame_number
 
 
-@dataclass(frozen=True, eq=False)
-class Keyframe:
+@dataclass(frozen=True, eq=False, repr=False)
+class Keyframe(Brief):
     """A posed frame and the map points it observed: pixels (n, 2) and point_ids (n,), which index into the submap."""
 
     name: str
@@ -47,8 +48,8 @@ class Keyframe:
         return points @ self.cam_from_map[:3, :3].T + self.cam_from_map[:3, 3]
 
 
-@dataclass(frozen=True, eq=False)
-class Submap:
+@dataclass(frozen=True, eq=False, repr=False)
+class Submap(Brief):
     """Points (n, 3) by id, and the keyframes that share their frame of reference and scale."""
 
     id: int
@@ -105,8 +106,8 @@ class Submap:
         return np.concatenate(errors)
 
 
-@dataclass(frozen=True)
-class SparseMap:
+@dataclass(frozen=True, repr=False)
+class SparseMap(Brief):
     """All submaps of one sequence. Where they came from is kept for messages."""
 
     submaps: tuple[Submap, ...]

@@ -63,7 +63,7 @@ class TsdfVolume:
     (densify.fusion.marching_cubes), and held in a slot.
     """
 
-    def __init__(self, voxel: float, config: FusionConfig):
+    def __init__(self, voxel: float, config: FusionConfig = FusionConfig()):
         if not np.isfinite(voxel) or voxel <= 0:
             raise InputError(f"voxel size {voxel}; expected a positive length in map units")
         self.voxel = voxel

@@ -53,6 +53,9 @@ class FrameSequence(Sequence[Frame]):
     def __len__(self) -> int:
         return len(self.names)
 
+    def __repr__(self) -> str:
+        return f"FrameSequence({len(self)} frames, {self.names[0]} to {self.names[-1]}, of {self.source})"
+
     @overload
     def __getitem__(self, index: int) -> Frame: ...
     @overload
