@@ -36,10 +36,11 @@ from lightdepth.camera_conversion import without_k3
 from lightdepth.datasets.checks import AS_GIVEN, INVERSE, READINGS, fitting_reading
 from lightdepth.datasets.folder import image_folder
 from lightdepth.datasets.format import Format
-from lightdepth.datasets.scared_files import IMAGES, VIDEO, StereoVideo, numbered_members
+from lightdepth.datasets.scared_files import IMAGES, VIDEO, numbered_members
 from lightdepth.datasets.sequence import FrameSequence, along_ray
+from lightdepth.datasets.video import VideoFile
 from lightdepth.errors import InputError
-from lightdepth.files.images import decode_raw, read_image, read_raw
+from lightdepth.files.images import decode_raw, read_image, read_raw, unit_range
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.sparse_map import check_rigid
@@ -110,25 +111,30 @@ def _read_keyframe(
 def _read_sequence(
     path: Path, camera: CameraModel | None, light: PhotometricCalibration, mask: np.ndarray | None, view: str
 ) -> FrameSequence:
-    video = StereoVideo(path / VIDEO)
+    video = VideoFile(path / VIDEO)
+    if video.height % 2:
+        raise InputError(
+            f"{video.path}: {video.width}x{video.height}; expected the left view above the right, of one height"
+        )
+    height, fps = video.height // 2, video.rate or 25.0
     data, points = numbered_members(path / "data", *_DATA), numbered_members(path / "data", *_POINTS)
     records = {n: (name, _json(blob, name)) for n, name, blob in data.all()} if data is not None else {}
     if camera is None and not records:
         raise InputError(
             f"{path}: neither data/frame_data.tar.gz nor data/frame_data/; put it beside the video, or give --camera"
         )
-    numbers = sorted(records) if records else list(range(video.count))
-    if numbers[-1] >= video.count:
+    numbers = sorted(records) if records else list(range(len(video)))
+    if numbers[-1] >= len(video):
         raise InputError(
-            f"{path}: there is frame data {numbers[-1]}, but {VIDEO} has {video.count} frames, from 0; is it complete?"
+            f"{path}: there is frame data {numbers[-1]}, but {VIDEO} has {len(video)} frames, from 0; is it complete?"
         )
     calibration = _from_json(*records[numbers[0]], view) if records else None
     if camera is None:
         assert calibration is not None
-        camera = _camera(calibration, video.width, video.height, path)
+        camera = _camera(calibration, video.width, height, path)
     poses = {n: _pose(*record) for n, record in records.items()}
     view_from_left = np.eye(4) if view == "left" or calibration is None else calibration.right_from_left
-    first_row = 0 if view == "left" else video.height
+    first_row = 0 if view == "left" else height
     names = [f"{n:06d}" for n in numbers]
     # An archive is read from its start: its middle and end would cost minutes
     sampled = None if points is None or points.cheap else range(0, min(11, len(numbers)), 5 if len(numbers) > 5 else 1)
@@ -142,11 +148,11 @@ def _read_sequence(
                 distance = _distance(decode_raw(blob[1], blob[0]), camera, blob[0], first_row)
             return Frame(
                 names[i],
-                video.frame(number)[first_row : first_row + video.height],
+                unit_range(video.read(number)[first_row : first_row + height]),
                 camera,
                 light,
                 mask,
-                time=number / video.fps,
+                time=number / fps,
                 true_distance=distance,
                 true_world_from_cam=reading(poses[number]) @ np.linalg.inv(view_from_left) if number in poses else None,
             )

@@ -1,4 +1,4 @@
-"""What a keyframe folder of SCARED is kept in: numbered members of an archive or of a folder, and the stereo video.
+"""What a keyframe folder of SCARED is kept in: numbered members of an archive or of a folder, beside the stereo video.
 
 Archives are read where they are, a member at a time and by its name alone; going back in one starts from its beginning.
 """
@@ -9,9 +9,6 @@ import os
 import re
 import tarfile
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
@@ -110,66 +107,3 @@ def numbered_members(folder: Path, name: str, pattern: str) -> Folder | Archive 
         return Folder(folder / name, pattern)
     archive = folder / f"{name}.tar.gz"
     return Archive(archive, pattern) if archive.is_file() else None
-
-
-class StereoVideo:
-    """Frames of rgb.mp4 by number; in order they cost one decoding each."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._container: Any = None
-        self._frames: Any = None
-        self._next = 0
-        self._last: tuple[int, np.ndarray] | None = None
-        self._process = 0
-        with self._opened() as container:
-            stream = container.streams.video[0]
-            self.width, rows = stream.codec_context.width, stream.codec_context.height
-            self.fps = float(stream.average_rate or 25)
-            self.count = stream.frames or sum(1 for _ in container.demux(stream)) - 1  # demuxing ends with an empty one
-        if rows % 2:
-            raise InputError(f"{path}: {self.width}x{rows}; expected the left view above the right, of one height")
-        self.height = rows // 2
-
-    def _opened(self) -> Any:
-        import av
-
-        try:
-            return av.open(str(self._path))
-        except (OSError, av.error.FFmpegError) as error:
-            raise InputError(f"{self._path}: not a readable video ({error})") from error
-
-    def frame(self, number: int) -> np.ndarray:
-        """(2 H, W, 3) float32 RGB in [0, 1], both views."""
-        import av
-
-        if self._last is not None and self._last[0] == number:
-            return self._last[1]
-        try:
-            if self._process != os.getpid() or not self._next <= number <= self._next + 60:
-                self._seek(number)
-            while True:
-                frame = next(self._frames)
-                found = self._index(frame)
-                self._next = found + 1
-                if found >= number:
-                    break
-        except (StopIteration, av.error.FFmpegError) as error:
-            raise InputError(f"{self._path}: frame {number} cannot be decoded; is the video complete?") from error
-        if found != number:
-            raise InputError(f"{self._path}: there is no frame {number}; the next is {found}")
-        self._last = (number, frame.to_ndarray(format="rgb24").astype(np.float32) / np.float32(255))
-        return self._last[1]
-
-    def _seek(self, number: int) -> None:
-        """To the last frame before `number` that is coded by itself."""
-        if self._process != os.getpid():  # a data loader's worker must not share the place in the file
-            self._container, self._process = self._opened(), os.getpid()
-        stream = self._container.streams.video[0]
-        time = int(number / (self.fps * stream.time_base)) + (stream.start_time or 0)
-        self._container.seek(time, stream=stream)
-        self._frames = self._container.decode(stream)
-
-    def _index(self, frame: Any) -> int:
-        stream = self._container.streams.video[0]
-        return round(float((frame.pts - (stream.start_time or 0)) * stream.time_base) * self.fps)
