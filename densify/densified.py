@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 
 from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
-from densify.evaluation.page import Gallery
 from densify.joining import MergeConfig, Merged, joined_name, merge
+from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify
 from densify.predictions import Seen
 from lightdepth.checkpoint import load_model

@@ -10,11 +10,11 @@ import numpy as np
 
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 from lightdepth.light.fit_on_map import fit_assumed_light, with_light
 from lightdepth.maps import read_map
-from lightdepth.maps.checks import check_shared_frames
 from lightdepth.models import DepthModel
 from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run

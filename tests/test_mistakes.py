@@ -28,11 +28,11 @@ from lightdepth.camera import KannalaBrandt
 from lightdepth.cli import main
 from lightdepth.datasets import open_sequence, write_c3vd, write_endomapper, write_folder, write_hamlyn, write_simcol
 from lightdepth.datasets.catalogue import read_dataset_yaml
+from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.datasets.splits import folders, read_split
 from lightdepth.errors import InputError
 from lightdepth.files.tum import write_tum
 from lightdepth.maps import read_map, write_multimap, write_text_model
-from lightdepth.maps.checks import check_shared_frames
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.tube import lens
 

@@ -13,7 +13,7 @@ import pytest
 from colons import colon, sequence, slam, truth
 
 from densify.config import DensifyConfig
-from densify.evaluation.page import Gallery, densify_page
+from densify.page import Gallery, densify_page
 from densify.pipeline import densify
 from lightdepth.models import ConstantModel
 from lightdepth.reporting.figures import png

@@ -29,8 +29,8 @@ def beside(output: Path) -> list[str]:
 def test_run_json_says_what_was_run_on_what_with_which_versions(tmp_path):
     (tmp_path / "in.txt").write_text("input")
     with run_folder(tmp_path / "out", "densify", {"data": tmp_path / "in.txt", "share": np.float32(0.5)}) as run:
-        run.hash_input("data", tmp_path / "in.txt")
-        run.hash_input("mask", None)
+        run.hash_inputs(data=tmp_path / "in.txt")
+        run.hash_inputs(mask=None)
         run.record["maps"] = [{"map": np.int64(1), "median": math.inf}]
         run.log("a line")
     record = json.loads((tmp_path / "out" / "run.json").read_text())

@@ -7,8 +7,8 @@ from pathlib import Path
 from densify.config import DensifyConfig
 from densify.densified import Densified
 from densify.evaluation.judge import dense_models, judge_maps, read_run, read_truth
-from densify.evaluation.page import densify_page
 from densify.evaluation.tables import write_evaluations
+from densify.page import densify_page
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import open_sequence
 from lightdepth.maps import read_map

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
-from densify.evaluation.page import densify_page, joined_section
 from densify.inputs import check_unit, fitted_light, map_and_frames
 from densify.joining import MergeConfig
+from densify.page import densify_page, joined_section
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError

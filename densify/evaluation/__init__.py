@@ -1,1 +1,1 @@
-"""What is judged against truth, between submaps and by withheld points; its tables and pages."""
+"""What is judged against truth, between submaps and by withheld points; its tables and pictures."""

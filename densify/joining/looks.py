@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 
+from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
-
-if TYPE_CHECKING:
-    from densify.joining.side import Side
+from lightdepth.sparse_map import Submap
 
 
-def descriptors(side: Side, per_point: int = 3, window: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+def descriptors(
+    submap: Submap, frames: FrameSequence, reach: float, per_point: int = 3, window: float = 0.05
+) -> tuple[np.ndarray, np.ndarray]:
     """Rows of points (n,) and SIFT descriptors (n, 128) of their surroundings, in up to per_point of their keyframes.
 
     The distance of a point tells how large its surroundings are in the image, and their brightness which way is up, so
-    that neither has to be guessed: `window` is the feature's size, in shares of the reach.
+    that neither has to be guessed: `window` is the feature's size, in shares of the submap's `reach`.
     """
-    assert side.frames is not None
-    seen = np.zeros(len(side.submap.points), int)
+    seen = np.zeros(len(submap.points), int)
     rows, looks = [], []
     sift = cv2.SIFT.create()
-    for keyframe in side.submap.keyframes[::2] if len(side.submap.keyframes) > 8 else side.submap.keyframes:
-        ids, points, pixels = side.submap.observed_points(keyframe)
-        own = side.submap.rows_of(ids)[0]
+    for keyframe in submap.keyframes[::2] if len(submap.keyframes) > 8 else submap.keyframes:
+        ids, points, pixels = submap.observed_points(keyframe)
+        own = submap.rows_of(ids)[0]
         wanted = seen[own] < per_point
         try:
-            frame = side.frames.of_keyframe(keyframe)
+            frame = frames.of_keyframe(keyframe)
         except InputError:  # missing, unreadable, or of another size: its reason is in keyframes.csv
             continue
         if not wanted.any():
@@ -36,7 +34,7 @@ def descriptors(side: Side, per_point: int = 3, window: float = 0.05) -> tuple[n
         own, points, pixels = own[wanted], points[wanted], pixels[wanted]
         grey = cv2.cvtColor((frame.image * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
         distance = np.linalg.norm(keyframe.in_camera(points), axis=1)
-        sizes = (window * keyframe.camera.focal_length * side.reach / distance.clip(min=1e-9)).clip(2, 40)
+        sizes = (window * keyframe.camera.focal_length * reach / distance.clip(min=1e-9)).clip(2, 40)
         wished = [
             cv2.KeyPoint(float(x - 0.5), float(y - 0.5), float(size), _upwards(grey, x, y, 3 * size), 1, 0, i)
             for i, ((x, y), size) in enumerate(zip(pixels, sizes, strict=True))

@@ -54,7 +54,8 @@ class Side:
 
     @cached_property
     def looks(self) -> tuple[np.ndarray, np.ndarray]:
-        return descriptors(self)
+        assert self.frames is not None, "without images nothing can look alike"
+        return descriptors(self.submap, self.frames, self.reach)
 
     def shape(self, ratio: float) -> Shape:
         if ratio not in self._shapes:

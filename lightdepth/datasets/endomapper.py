@@ -29,6 +29,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.files.schema import read_json
 from lightdepth.frame import Frame, check_image_size, frame_number
+from lightdepth.maps import read_map
 from lightdepth.photometry import PhotometricCalibration
 
 _LEVELS = 6  # folders above the frames in which calibrations are looked for
@@ -133,8 +134,6 @@ def write_endomapper(frames: Sequence[Frame], path: Path, endoscope: str = "00")
 
 def _in_cluster(path: Path, images: list[Path]) -> tuple[list[Path], CameraModel | None]:
     """The images of a cluster, and the camera of its model where there is one."""
-    from lightdepth.maps import read_map  # which reads trajectories with datasets.folder
-
     cluster = cluster_of(path)
     assert cluster is not None
     model = cluster[0] / "sparse" / path.stem

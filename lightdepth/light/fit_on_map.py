@@ -22,10 +22,10 @@ import numpy as np
 
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
+from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.decline import BLUR, V_FLOOR, masked_blur
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, check_image_size, to_batch
-from lightdepth.maps.checks import check_shared_frames
 from lightdepth.models import ConstantModel, DeclineModel, working_size
 from lightdepth.observations import observed_distances
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness

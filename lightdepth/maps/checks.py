@@ -17,10 +17,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.maps.convention import SIDECAR, distorted
-from lightdepth.sparse_map import Keyframe, SparseMap, Submap
+from lightdepth.sparse_map import Keyframe, Submap
 
 MAX_MEDIAN_PX = 5.0
 _MIN_SHARE_IN_VIEW = 0.5
@@ -82,23 +81,6 @@ def _whisper_half_a_pixel(submap: Submap, where: Path, median: float) -> None:
                 f'(0, 0) or at (0.5, 0.5) for both; which, "pixel_center" in {SIDECAR} says',
                 stacklevel=3,
             )
-
-
-def check_shared_frames(sparse_map: SparseMap, frames: FrameSequence) -> None:
-    """Raises InputError when no keyframe of the map has the number of a frame; warns when most have not."""
-    mapped = sorted({k.number for submap in sparse_map.submaps for k in submap.keyframes})
-    shared = set(mapped) & set(frames.numbers)
-    if 2 * len(shared) > len(mapped):
-        return
-    first, last = min(frames.numbers), max(frames.numbers)
-    if mapped[-1] - mapped[0] > 100 * (last - first + 1):
-        cure = "are the map's times in milliseconds?"
-    else:
-        cure = f'if one counts from elsewhere, put "frame_offset" into {SIDECAR}'
-    found = f"{sparse_map.source}: keyframes {mapped[0]} to {mapped[-1]}, {frames.source}: frames {first} to {last}"
-    if not shared:
-        raise InputError(f"{found}, and none in common. They meet by the number in their names; {cure}")
-    warnings.warn(f"{found}; {len(shared)} of {len(mapped)} keyframes have a frame; {cure}", stacklevel=2)
 
 
 def seen_by_projection(submap: Submap, hide: bool = False) -> Submap:

@@ -21,11 +21,11 @@ import torch
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model, save_model
 from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.light.fit_on_map import LightView, fit_assumed_light, map_views, with_light, withheld_error
 from lightdepth.maps import read_map
-from lightdepth.maps.checks import check_shared_frames
 from lightdepth.models import DeclineModel, DepthModel, NetworkModel, working_size
 from lightdepth.options import Group
 from lightdepth.photometry import PhotometricCalibration

@@ -1,0 +1,27 @@
+"""Frames and the keyframes of a map: they meet by the number in their names."""
+
+from __future__ import annotations
+
+import warnings
+
+from lightdepth.datasets.sequence import FrameSequence
+from lightdepth.errors import InputError
+from lightdepth.maps.convention import SIDECAR
+from lightdepth.sparse_map import SparseMap
+
+
+def check_shared_frames(sparse_map: SparseMap, frames: FrameSequence) -> None:
+    """Raises InputError when no keyframe of the map has the number of a frame; warns when most have not."""
+    mapped = sorted({k.number for submap in sparse_map.submaps for k in submap.keyframes})
+    shared = set(mapped) & set(frames.numbers)
+    if 2 * len(shared) > len(mapped):
+        return
+    first, last = min(frames.numbers), max(frames.numbers)
+    if mapped[-1] - mapped[0] > 100 * (last - first + 1):
+        cure = "are the map's times in milliseconds?"
+    else:
+        cure = f'if one counts from elsewhere, put "frame_offset" into {SIDECAR}'
+    found = f"{sparse_map.source}: keyframes {mapped[0]} to {mapped[-1]}, {frames.source}: frames {first} to {last}"
+    if not shared:
+        raise InputError(f"{found}, and none in common. They meet by the number in their names; {cure}")
+    warnings.warn(f"{found}; {len(shared)} of {len(mapped)} keyframes have a frame; {cure}", stacklevel=2)
