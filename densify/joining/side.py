@@ -55,7 +55,9 @@ class Side:
     @cached_property
     def looks(self) -> tuple[np.ndarray, np.ndarray]:
         assert self.frames is not None, "without images nothing can look alike"
-        return descriptors(self.submap, self.frames, self.reach)
+        observed = any(len(self.submap.observed_points(k)[0]) for k in self.submap.keyframes)
+        reach = self.reach if observed else 0.0  # nobody observed a point: there is none to describe, and no reach
+        return descriptors(self.submap, self.frames, reach)
 
     def shape(self, ratio: float) -> Shape:
         if ratio not in self._shapes:
