@@ -16,6 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from lightdepth.errors import InputError
+from lightdepth.files.writing import write_whole
 from lightdepth.models import ConstantModel, DeclineModel, DepthModel, NetworkModel
 from lightdepth.network import DepthNetwork, NetworkConfig, build_network
 
@@ -43,7 +44,7 @@ def save_model(network: DepthNetwork, path: Path | str, card: dict[str, Any], ha
 
     weights = {name: stored(tensor) for name, tensor in network.state_dict().items()}
     metadata = {"network": json.dumps(network.config.to_dict()), "card": json.dumps(card)}
-    Path(path).write_bytes(save(weights, metadata=metadata))
+    write_whole(path, save(weights, metadata=metadata))
 
 
 def load_model(name_or_path: str | Path = DEFAULT_CHECKPOINT, details: bool = True) -> DepthModel:

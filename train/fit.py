@@ -32,6 +32,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from lightdepth.checkpoint import load_model, save_model
 from lightdepth.errors import InputError
+from lightdepth.files.writing import write_whole
 from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
@@ -125,7 +126,7 @@ def fit(
         output.mkdir(parents=True, exist_ok=True)
         for name in _OURS if overwrite else ("run.json",):
             _remove(output / name)
-        (output / "config.yaml").write_text(config_yaml)
+        write_whole(output / "config.yaml", config_yaml)
     echo(
         f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
     )
@@ -149,7 +150,7 @@ def fit(
         steps = int(torch.load(last, map_location="cpu", weights_only=True)["global_step"])
         card = _card(model, data, steps, seed, chosen.stem, errors, settings, doubt)
         save_model(exported.network, output / "model.safetensors", card)
-        (output / "model.md").write_text(card_text(card, output.name))
+        write_whole(output / "model.md", card_text(card, output.name))
         echo(f"exported the {chosen.stem} checkpoint to {output / 'model.safetensors'}")
         record = {
             "seed": seed,
@@ -190,7 +191,7 @@ def _calibrate(network: DepthNetwork, data: FrameDataModule, output: Path) -> di
     fitted = fit_calibration(frames)
     _set_calibration(network, fitted)
     frames = [Doubted(frame.error, fitted(frame.sigma)) for frame in frames]
-    (output / "uncertainty.png").write_bytes(chart_png(frames))
+    write_whole(output / "uncertainty.png", chart_png(frames))
     return {"exponent": round(fitted.exponent, 4), "scale": round(fitted.scale, 4), **summary(frames)}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -26,6 +25,7 @@ from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, Recipe, load_mod
 from densify.config import DensifyConfig, OfflineConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
+from lightdepth.files.writing import write_whole
 from lightdepth.options import Group
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, git_revision, plain, recorded, run_folder, versions
@@ -115,9 +115,7 @@ def compare_runs(a: Path, b: Path, output: Path | None = None, seed: int = 0) ->
     print(found.markdown(str(a), str(b)))
     if output is not None:
         data = {"kind": "bench comparison", "a": a, "b": b, **asdict(found), "verdict": found.verdict}
-        partial = output.with_name(f"{output.name}.partial")
-        partial.write_text(json.dumps(plain(data), indent=1) + "\n")
-        os.replace(partial, output)
+        write_whole(output, json.dumps(plain(data), indent=1) + "\n")
 
 
 def compare_estimators(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from densify.evaluation.judge import read_run
 from densify.measure import chosen_map, measured, places_in_frame, run_unit, summary
 from lightdepth.errors import InputError
+from lightdepth.files.writing import write_whole
 from lightdepth.reporting.run import plain
 
 
@@ -49,6 +49,4 @@ def measure(
     result = {"run": str(run), "map": dense.id, "unit": unit, **found}
     print(summary(found, unit))
     if output is not None:
-        partial = output.with_name(f"{output.name}.partial")
-        partial.write_text(json.dumps(plain(result), indent=1) + "\n")
-        os.replace(partial, output)
+        write_whole(output, json.dumps(plain(result), indent=1) + "\n")

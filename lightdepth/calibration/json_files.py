@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
-from lightdepth.files.text import write_text
+from lightdepth.files.writing import write_whole
 from lightdepth.photometry import PhotometricCalibration
 
 
@@ -56,7 +56,7 @@ def camera_from_fields(data: Any, where: str) -> CameraModel:
 
 def write_camera_json(camera: CameraModel, path: Path) -> None:
     data = {"model": camera.name, "width": camera.width, "height": camera.height, "params": list(camera.params)}
-    write_text(path, json.dumps({**data, "pixel_center": 0.5}, indent=1) + "\n")
+    write_whole(path, json.dumps({**data, "pixel_center": 0.5}, indent=1) + "\n")
 
 
 def light_from_text(text: str) -> PhotometricCalibration:
@@ -82,4 +82,4 @@ def _light(data: Any, where: str) -> PhotometricCalibration:
 
 
 def write_light_json(light: PhotometricCalibration, path: Path) -> None:
-    write_text(path, json.dumps(asdict(light), indent=1) + "\n")
+    write_whole(path, json.dumps(asdict(light), indent=1) + "\n")

@@ -21,7 +21,8 @@ import numpy as np
 from lightdepth.calibration.plain_text import cannot_hold
 from lightdepth.camera import CameraModel, Scaramuzza, camera_from_params
 from lightdepth.errors import InputError
-from lightdepth.files.text import read_text, rows, to_numbers, write_text
+from lightdepth.files.text import read_text, rows, to_numbers
+from lightdepth.files.writing import write_whole
 
 _INVERSE_ERROR_PX = 0.01  # the toolbox's own
 _LINES = "calib_results.txt with five lines: polynomial, inverse polynomial, centre, affine c d e, height and width"
@@ -81,7 +82,9 @@ def write_ocamcalib(camera: CameraModel, path: Path) -> None:
         "affine parameters c, d, e": [c, d, e],
         "image size: height and width": [camera.height, camera.width],
     }
-    write_text(path, "\n".join(f"#{what}\n\n{' '.join(repr(v) for v in numbers)}\n" for what, numbers in lines.items()))
+    write_whole(
+        path, "\n".join(f"#{what}\n\n{' '.join(repr(v) for v in numbers)}\n" for what, numbers in lines.items())
+    )
 
 
 def _inverse(camera: Scaramuzza) -> list[float]:

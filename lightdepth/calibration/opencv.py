@@ -17,7 +17,8 @@ import yaml
 from lightdepth.calibration.plain_text import cannot_hold
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, camera_from_params
 from lightdepth.errors import InputError
-from lightdepth.files.text import read_text, to_numbers, write_text
+from lightdepth.files.text import read_text, to_numbers
+from lightdepth.files.writing import write_whole
 
 _FISHEYE = ("fisheye", "equidistant")
 _BROWN = ("plumb_bob", "radtan", "opencv", "brown", "")
@@ -154,7 +155,7 @@ def write_opencv(camera: CameraModel, path: Path) -> None:
         shape = f"   rows: {height}\n   cols: {len(numbers) // height}\n   dt: d\n"
         return f"{name}: !!opencv-matrix\n{shape}   data: [ {data} ]\n"
 
-    write_text(
+    write_whole(
         path,
         f"%YAML:1.0\n---\nimage_width: {camera.width}\nimage_height: {camera.height}\n"
         + matrix("camera_matrix", 3, [fx, 0, cx, 0, fy, cy, 0, 0, 1])

@@ -14,7 +14,8 @@ import numpy as np
 from lightdepth.camera import CameraModel, Pinhole, Scaramuzza, camera_from_params
 from lightdepth.errors import InputError
 from lightdepth.files.colmap_cameras import read_cameras_text
-from lightdepth.files.text import read_text, rows, to_numbers, write_text
+from lightdepth.files.text import read_text, rows, to_numbers
+from lightdepth.files.writing import write_whole
 
 
 def cannot_hold(path: Path, program: str, what: str, *models: str) -> InputError:
@@ -41,7 +42,7 @@ def write_colmap_camera(camera: CameraModel, path: Path) -> None:
     if isinstance(camera, Scaramuzza):
         raise cannot_hold(path, "COLMAP", "SCARAMUZZA camera", "OPENCV_FISHEYE", "OPENCV", "PINHOLE")
     numbers = " ".join(repr(float(p)) for p in camera.params)
-    write_text(
+    write_whole(
         path, f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {camera.name} {camera.width} {camera.height} {numbers}\n"
     )
 
@@ -78,7 +79,7 @@ def write_intrinsics(camera: CameraModel, path: Path, side: int = 3) -> None:
         raise cannot_hold(path, "intrinsics.txt", f"{camera.name} camera", "PINHOLE")
     fx, fy, cx, cy = camera.with_pixel_center(1.0).params  # half a pixel back, to OpenCV's
     matrix = _intrinsics(fx, fy, cx, cy, 0.0, side)
-    write_text(path, "".join(" ".join(repr(float(v)) for v in row) + "\n" for row in matrix))
+    write_whole(path, "".join(" ".join(repr(float(v)) for v in row) + "\n" for row in matrix))
 
 
 def _intrinsics(fx: float, fy: float, cx: float, cy: float, skew: float, side: int) -> np.ndarray:

@@ -22,7 +22,8 @@ from defusedxml import DefusedXmlException
 from lightdepth.calibration.plain_text import cannot_hold
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, camera_from_params
 from lightdepth.errors import InputError
-from lightdepth.files.text import read_text, to_numbers, write_text
+from lightdepth.files.text import read_text, to_numbers
+from lightdepth.files.writing import write_whole
 from lightdepth.photometry import PhotometricCalibration
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def write_vicalib(camera: CameraModel, path: Path) -> None:
     else:
         what = "OPENCV camera with tangential terms" if isinstance(camera, Brown) else f"{camera.name} camera"
         raise cannot_hold(path, "vicalib's XML", what, "OPENCV_FISHEYE", "PINHOLE")
-    write_text(
+    write_whole(
         path,
         "<rig>\n    <camera>\n"
         f'        <camera_model name="" index="0" serialno="0" type="{kind}" version="8">\n'
@@ -109,7 +110,7 @@ def read_photometric(path: Path) -> PhotometricCalibration:
 def write_photometric(light: PhotometricCalibration, path: Path) -> None:
     """EndoMapper's photometric calibration. It has no place for gain, reflectance and source."""
     metres = [v / 1000 for v in light.position_mm]
-    write_text(
+    write_whole(
         path,
         '<rig>\n    <camera>\n        <camera_model index="0" name="" serialno="0" type="gamma" version="1.0">\n'
         f"            <gamma> {_row([light.gamma])} </gamma>\n        </camera_model>\n    </camera>\n"

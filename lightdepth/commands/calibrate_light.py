@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from lightdepth.calibration import write_light
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
+from lightdepth.files.writing import write_together
 from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.light.report import light_page
@@ -54,9 +54,5 @@ def calibrate_light(
         frames = source.open(sparse_map.submaps[0].keyframes[0].camera)
         fit = fit_on_map(frames, sparse_map, camera=frames[0].camera if camera is not None else None, rng=rng)
         what = f"{data}, {sparse_map.source}"
-    output.parent.mkdir(parents=True, exist_ok=True)
-    partial = output.with_name(f".{output.name}.partial")
-    for path, write in ((page_path, light_page(fit, what).write), (output, lambda p: write_light(fit.light, p))):
-        write(partial)
-        os.replace(partial, path)
+    write_together({page_path: light_page(fit, what).write, output: lambda path: write_light(fit.light, path)})
     print(f"light: {fit.summary()}\n{output}, {page_path}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,13 +21,6 @@ def read_text(path: Path, expected: str) -> str:
     if "\0" in text:
         raise InputError(f"{path}: not a text file; {expected}")
     return text
-
-
-def write_text(path: Path, text: str) -> None:
-    """The file, whole or not at all."""
-    partial = Path(path).with_name(f".{Path(path).name}.partial")
-    partial.write_text(text)
-    os.replace(partial, path)
 
 
 def rows(text: str) -> list[list[str]]:

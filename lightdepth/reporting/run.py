@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import platform
 import resource
 import shutil
@@ -25,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from lightdepth.errors import InputError, PartialFailure
+from lightdepth.files.writing import move_whole, write_whole
 
 PACKAGES = (
     "lightdepth",
@@ -105,7 +105,7 @@ def run_folder(output: Path, verb: str, arguments: Mapping[str, Any], overwrite:
         raise
     if output.is_dir():
         shutil.rmtree(output)
-    staging.rename(output)
+    move_whole(staging, output)
     if run.record["failures"]:
         first = run.record["failures"][0]
         raise PartialFailure(
@@ -129,9 +129,7 @@ def write_run_json(
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
         **plain(record),
     }
-    partial = folder / "run.json.partial"
-    partial.write_text(json.dumps(data, indent=1) + "\n")
-    os.replace(partial, folder / "run.json")
+    write_whole(folder / "run.json", json.dumps(data, indent=1) + "\n")
 
 
 def versions() -> dict[str, str]:

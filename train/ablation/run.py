@@ -15,7 +15,6 @@ import copy
 import io
 import json
 import math
-import os
 import re
 import shutil
 import sys
@@ -34,6 +33,7 @@ from jsonargparse import ArgumentParser, Namespace
 from lightdepth.checkpoint import load_model
 from lightdepth.decline import log_closed_form
 from lightdepth.errors import InputError, PartialFailure
+from lightdepth.files.writing import write_whole
 from lightdepth.frame import FrameBatch, to_batch
 from lightdepth.geometry import depth_from_distance
 from lightdepth.losses import LossConfig, self_supervised_loss
@@ -287,10 +287,7 @@ def _train_all(parser: ArgumentParser, todo: Sequence[_Plan], judge: Judge) -> N
         if plan.seed != seed:
             seed, rendered = plan.seed, []
         result = _trained(parser, plan, judge, rendered)
-        plan.path.parent.mkdir(parents=True, exist_ok=True)
-        partial = plan.path.with_suffix(".json.partial")
-        partial.write_text(json.dumps({"stamp": plan.stamp, "result": plain(result)}, indent=1) + "\n")
-        os.replace(partial, plan.path)
+        write_whole(plan.path, json.dumps({"stamp": plan.stamp, "result": plain(result)}, indent=1) + "\n")
         done += plan.config.trainer.max_steps
         left = (time.monotonic() - started) / done * (steps - done) / 60
         said = result.failed or f"{result.overall():.3f} of the closed form's errors"

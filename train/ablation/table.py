@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lightdepth.files.writing import write_whole
 from lightdepth.reporting.run import git_revision
 
 from ..colons import TubeData, colon_seeds
@@ -162,18 +162,11 @@ def write_table(table: Table, output: Path, copy: Path | None) -> None:
     text = markdown(table)
     output.mkdir(parents=True, exist_ok=True)
     summary = [_summary(line) for line in lines(table)]
-    _write(output / "ablation.json", json.dumps(summary, indent=1) + "\n")
-    _write(output / "ablation.csv", _csv(table))
-    _write(output / "ablation.md", text)
+    write_whole(output / "ablation.json", json.dumps(summary, indent=1) + "\n")
+    write_whole(output / "ablation.csv", _csv(table))
+    write_whole(output / "ablation.md", text)
     if copy is not None:
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        _write(copy, text)
-
-
-def _write(path: Path, text: str) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    os.replace(partial, path)
+        write_whole(copy, text)
 
 
 def _summary(line: Line) -> dict[str, Any]:

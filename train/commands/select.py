@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, field, fields
 from pathlib import Path
 from typing import Literal
@@ -18,6 +17,7 @@ import numpy as np
 
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.errors import InputError
+from lightdepth.files.writing import Content, write_together
 from lightdepth.maps import read_map
 from lightdepth.options import Group
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
@@ -107,14 +107,14 @@ def select(
 
     picture = None if no_frames else _sheet(frames, verdicts)
     page = _page(data, summary, how, settings, verdicts, picture)
-    writers: dict[Path, Callable[[Path], object]] = {
-        paths["table"]: lambda p: p.write_text(_table(verdicts)),
+    writers: dict[Path, Content] = {
+        paths["table"]: _table(verdicts),
         paths["page"]: page.write,
-        paths["list"]: lambda p: p.write_text("\n".join(listed) + "\n"),  # last: its presence means all is there
+        paths["list"]: "\n".join(listed) + "\n",  # last: its presence means all is there
     }
     if picture is not None:
-        writers = {paths["sheet"]: lambda p: p.write_bytes(picture), **writers}
-    _write(writers)
+        writers = {paths["sheet"]: picture, **writers}
+    write_together(writers)
     if no_frames:
         paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
     print(f"{summary}\n{', '.join(str(path) for path in writers)}")
@@ -131,22 +131,6 @@ def _paths(output: Path, no_frames: bool, overwrite: bool) -> dict[str, Path]:
     if there and not overwrite:
         raise InputError(f"{there[0]}: already there; choose another -o, or give --overwrite")
     return paths
-
-
-def _write(writers: dict[Path, Callable[[Path], object]]) -> None:
-    """All files beside their places first; nothing takes its place before all are written."""
-    partial = {path: path.with_name(f".{path.name}.partial") for path in writers}
-    try:
-        for path, write in writers.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write(partial[path])
-        for path in writers:
-            os.replace(partial[path], path)
-    except OSError as error:
-        raise InputError(f"{next(iter(writers)).parent}: cannot be written to ({error.strerror})") from error
-    finally:
-        for path in partial.values():
-            path.unlink(missing_ok=True)
 
 
 def _by_map(frames: FrameSequence, sparse_map: SparseMap, folder: Path, rules: MapRules) -> tuple[list[Verdict], str]:

@@ -1,0 +1,77 @@
+"""What is written appears whole or not at all, also when the machine dies on the way.
+
+A file is written beside its place, brought to the disk and renamed; then the folder that names it is brought to the
+disk too. Files inside a run folder in the making need none of this: the folder appears whole.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+from lightdepth.errors import InputError
+
+Content = str | bytes | Callable[[Path], object]
+"""Text, bytes, or a function that writes a file at the path that it is given (the ending is that of the real one)."""
+
+
+def write_whole(path: str | Path, content: Content) -> None:
+    """One file; its folder is made. Raises InputError where it cannot be written, and leaves what was there."""
+    write_together({Path(path): content})
+
+
+def write_together(contents: Mapping[Path, Content]) -> None:
+    """Several files: nothing takes its place before all are written; then they do, in the order given."""
+    partial = {path: path.with_name(f".partial-{path.name}") for path in contents}
+    with ExitStack() as leftovers:
+        for unfinished in partial.values():
+            leftovers.callback(_remove, unfinished)
+        try:
+            for path, content in contents.items():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                _write(partial[path], content)
+                sync(partial[path])
+            for path in contents:
+                os.replace(partial[path], path)
+            for folder in {path.parent for path in contents}:
+                sync(folder)
+        except OSError as error:
+            where = error.filename or next(iter(contents))
+            raise InputError(f"{where}: cannot be written ({error.strerror or error})") from error
+
+
+def move_whole(made: Path, path: Path) -> None:
+    """A finished folder takes its place: all that is in it is on the disk before it does."""
+    for folder, _, files in os.walk(made):
+        for file in files:
+            sync(Path(folder) / file)
+        sync(Path(folder))
+    made.rename(path)
+    sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Brings a file, or the names in a folder, to the disk."""
+    if path.is_dir() and os.name == "nt":  # a folder cannot be opened there
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _remove(path: Path) -> None:
+    with suppress(OSError):  # it never came to be
+        path.unlink()
+
+
+def _write(path: Path, content: Content) -> None:
+    if isinstance(content, str):
+        path.write_text(content, encoding="utf-8")
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        content(path)
