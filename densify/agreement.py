@@ -42,13 +42,27 @@ _LEAST_SIGMA = 0.01  # of log distance: exact data must not make a single residu
 class AgreementConfig:
     """What the keyframes of a submap must agree on."""
 
-    on: bool = True  # off, every keyframe keeps its LMedS scale, and nothing bends
-    overlap: float = 0.03  # weight of an overlap residual against a point's; 0: keyframes do not look at each other
-    neighbours: int = 4  # keyframes that each is compared with: those that share most points with it
-    samples: int = 16  # pixels across the image that are compared, as many as that keeps square
+    on: bool = True
+    """Whether the keyframes of a submap are aligned together; switched off, each keeps its LMedS scale and nothing
+    bends."""
+    overlap: float = 0.03
+    """Weight of an overlap residual against a point's; at 0, keyframes are not compared with each other. A larger one
+    makes neighbours agree better, and fit their points less."""
+    neighbours: int = 4
+    """Number of keyframes that each is compared with, those that share most points with it. More hold the submap
+    together better and take longer."""
+    samples: int = 16
+    """Number of pixels across the image that are compared, and as many down as keeps them square. More find finer
+    disagreement and take longer."""
     rounds: int = 8
-    tolerance: float = 1e-3  # of log distance: a round that moves nothing by more is the last
-    max_gap: float = 0.5  # overlap residuals beyond are of other tissue: occlusion
+    """Largest number of Gauss-Newton rounds, each with weights and projections renewed. More come closer to the
+    solution and take longer."""
+    tolerance: float = 1e-3
+    """Change in log distance; a round that changes nothing by more is the last. A larger one ends sooner, at a less
+    exact solution."""
+    max_gap: float = 0.5
+    """Overlap residual, in log distance, from which two pixels count as different tissue (occlusion) and are not
+    compared. A larger one compares more pixels."""
 
 
 @dataclass(frozen=True, repr=False)

@@ -28,18 +28,37 @@ Estimator = Literal["lmeds", "median"]
 class AlignmentConfig:
     """When a keyframe's scale is found, and when it is trusted."""
 
-    estimator: Estimator = "lmeds"  # of the scale; median: of the ratios, never refined, to compare with
-    t: float = 2.5  # a residual of at most t sigma makes an inlier
-    finite_sample: bool = False  # Rousseeuw's factor 1 + 5 / (n - 1) in sigma
-    refine: bool = True  # robust refinement on the inliers
-    loss: Loss = "geman_mcclure"  # of the refinement: geman_mcclure, huber, cauchy or tukey
-    min_points: int = 8  # observed points with a prediction; fewer are not worth a scale
-    min_inliers: int = 6  # points within t sigma
-    min_inlier_share: float = 0.5  # of the observed points
-    max_relative_sigma: float = 0.35  # sigma over the median mapped distance
-    min_spread_deg: float = 3.0  # root mean square angle between the inliers' rays and their mean
-    min_distance_spread: float = 0.02  # standard deviation of the inliers' log distance
-    max_second_mode: float = 0.6  # points that agree on another scale, over those that agree on this one
+    estimator: Estimator = "lmeds"
+    """How the first scale is found: lmeds, by the least median of squares, or median, the median of the ratios, which
+    is never refined and serves to compare with."""
+    t: float = 2.5
+    """Number of sigmas up to which a residual makes an inlier. More take in more points, wrong ones among them."""
+    finite_sample: bool = False
+    """Whether sigma is widened by Rousseeuw's factor 1 + 5 / (n - 1), which matters where n points are few."""
+    refine: bool = True
+    """Whether the LMedS scale is refined on its inliers by robust least squares."""
+    loss: Loss = "geman_mcclure"
+    """Robust loss of the refinement: geman_mcclure, huber, cauchy or tukey."""
+    min_points: int = 8
+    """Least number of observed points with a prediction that a keyframe needs. More make scales safer and leave out
+    more keyframes."""
+    min_inliers: int = 6
+    """Least number of points within t sigma that a keyframe needs. More make scales safer and leave out more
+    keyframes."""
+    min_inlier_share: float = 0.5
+    """Least share of the observed points that must be inliers. A larger one leaves out more keyframes."""
+    max_relative_sigma: float = 0.35
+    """Largest sigma of the residuals, as a share of the median mapped distance. A larger one trusts keyframes whose
+    points disagree more."""
+    min_spread_deg: float = 3.0
+    """Least root mean square angle between the inliers' rays and their mean, degrees. A larger one leaves out
+    keyframes whose inliers lie close together in the image."""
+    min_distance_spread: float = 0.02
+    """Least standard deviation of the inliers' log distance. A larger one leaves out keyframes whose inliers are all
+    about equally far."""
+    max_second_mode: float = 0.6
+    """Largest ratio of the points that agree on another scale to those that agree on this one. A larger one trusts
+    keyframes with a stronger rival."""
 
     def __post_init__(self) -> None:
         if self.estimator not in get_args(Estimator):

@@ -27,9 +27,14 @@ class BendingConfig:
     """How a keyframe's depth may bend. Off, it is scaled only."""
 
     on: bool = True
-    grids: tuple[int, ...] = (5,)  # bumps across and down, one number per level
-    slope_deviation: float = 0.3  # expected change of log d per change of log b
-    bump_deviation: float = 0.1  # expected size of a bump, in log d
+    """Whether a keyframe's depth may bend; switched off, it is only scaled."""
+    grids: tuple[int, ...] = (5,)
+    """Number of bumps across and down, one number for each level. More let depth bend in finer detail."""
+    slope_deviation: float = 0.3
+    """Expected change of log distance per change of log predicted distance; at 0 there is no slope. A larger one lets
+    near and far be stretched more freely."""
+    bump_deviation: float = 0.1
+    """Expected size of a bump, in log distance. A larger one lets depth bend more strongly."""
 
     def __post_init__(self) -> None:
         if any(n < 2 for n in self.grids):

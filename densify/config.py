@@ -73,14 +73,16 @@ class DensifyConfig(OfflineConfig):
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
     """when wall counts as seen well"""
     withhold: float = 0.2
-    """share of each keyframe's observed points that takes no part in the alignment, so that they can judge the surface;
-    more of it judges more surely, and aligns less well"""
+    """Share of each keyframe's observed points that takes no part in the alignment, so that the surface can be judged
+    by them. A larger one judges more surely, and aligns on fewer points."""
     seed: int = 0
-    """number that draws the withheld points; another one withholds other points"""
+    """Number that draws the withheld points of each keyframe. Another one withholds other points."""
     recipe: Recipe = "full"
-    """full, or paper: one LMedS scale per keyframe, one undistorted pinhole image, plain TSDF"""
+    """How dense maps are made: full, or paper, which is one LMedS scale per keyframe, one undistorted pinhole image,
+    and a plain TSDF. It has no agreement, bending, contradiction or rectification, and takes no settings of these."""
     keep_mb: float = 1000.0
-    """megabytes of images and predictions that are kept between the two passes over a submap; others are made again"""
+    """Memory for the frames and predictions of a submap that are kept between the passes over it, megabytes; others
+    are made again. More save time and change nothing else."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.withhold < 1:

@@ -27,9 +27,15 @@ class ContradictionConfig:
     """When a pixel is contradicted."""
 
     on: bool = True
-    tolerance: float = 0.05  # of log distance
-    judges: int = 8  # keyframes that each is compared with, evenly chosen among those that share points with it
-    samples: int = 80  # pixels across the image that are compared
+    """Whether pixels that nearer keyframes contradict are left out of the surface; switched off, they stay."""
+    tolerance: float = 0.05
+    """Difference in log distance up to which two keyframes agree on a pixel. A larger one leaves out fewer pixels."""
+    judges: int = 8
+    """Number of keyframes that each is compared with, evenly chosen among those that share points with it. More find
+    more contradictions and take longer."""
+    samples: int = 80
+    """Number of pixels across the image that are compared. More tell the edges of what is contradicted more finely
+    and take longer."""
 
 
 def uncontradicted(

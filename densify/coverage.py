@@ -26,9 +26,15 @@ from lightdepth.sparse_map import Keyframe
 class CoverageConfig:
     """When wall counts as seen well, and what is too small to mention."""
 
-    views: int = 3  # keyframes that saw it, at least
-    weight: float = 1.0  # their weights together, at least; 1 is one keyframe that nothing speaks against
-    min_voxels: float = 5.0  # patches and holes smaller than a square with this side, in voxels, are not listed
+    views: int = 3
+    """Least number of keyframes that must have seen a piece of wall for it to count as seen well. More make that
+    claim stricter."""
+    weight: float = 1.0
+    """Least weight of these keyframes together; 1 is one keyframe that nothing speaks against. A larger one makes the
+    claim stricter."""
+    min_voxels: float = 5.0
+    """Side of a square, in voxels, below whose area weakly seen patches and holes are not listed. A larger one lists
+    fewer."""
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,13 @@ import ast
 import inspect
 import sys
 from importlib import metadata, util
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from lightdepth.pages import PAGES, Page
+
+if TYPE_CHECKING:
+    from lightdepth.parsing import Parser
 
 GROUP = "lightdepth.commands"
 ORDER = (
@@ -35,8 +39,6 @@ ORDER = (
     "bench",
     "measure",
 )
-FILES = ("calibrate-light", "convert-camera", "select", "measure", "bench compare")
-"""Verbs that write a file; the others make a folder."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -77,16 +79,25 @@ def main(argv: list[str] | None = None) -> int:
 
 def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
-    import jsonargparse
+    from lightdepth.options import with_groups
+    from lightdepth.parsing import parsed
 
-    from lightdepth.options import add_groups, flags_of, groups_of, with_groups
+    parser = verb_parser(function, verb)
+    return with_groups(function, parser.instantiate(parsed(parser, argv)))
 
-    jsonargparse.set_parsing_settings(docstring_parse_attribute_docstrings=True)
 
+def verb_parser(function: Any, verb: str) -> Parser:
+    """The options of a verb: the parameters of its function."""
+    from docstring_parser import parse as parse_docstring
+
+    from lightdepth.options import add_groups, groups_of
+    from lightdepth.parsing import Parser, finish
+
+    said = {p.arg_name: p.description for p in parse_docstring(inspect.getdoc(function) or "").params}
     # The first line only: jsonargparse shows the rest of the docstring beside the options.
     summary = (inspect.getdoc(function) or "").split("\n")[0]
-    parser = jsonargparse.ArgumentParser(prog=f"lightdepth {verb}", description=summary, default_env=False)
-    parser.add_argument("--config", action="config", help="a YAML file with any of these options")
+    parser = Parser(prog=f"lightdepth {verb}", description=summary, default_env=False)
+    parser.add_argument("--config", action="config")
     parameters = inspect.signature(function).parameters
     # Declared here, because options derived from parameters have no short form and no bare flags.
     if "output" in parameters:
@@ -98,41 +109,19 @@ def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
             type=Path | None,
             required=needed,
             default=None if needed else default,
-            help="file to write" if verb in FILES else "folder to make",
+            help=said.get("output"),
         )
     if "overwrite" in parameters:
-        parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run made there")
+        parser.add_argument("--overwrite", action="store_true", help=said.get("overwrite"))
     if "no_frames" in parameters:
-        parser.add_argument("--no_frames", action="store_true", help="leave the pictures out")
+        parser.add_argument("--no_frames", action="store_true", help=said.get("no_frames"))
     declared: set[str | int] = {name for name in ("output", "overwrite", "no_frames") if name in parameters}
     add_groups(parser, function)
     parser.add_function_arguments(
         function, as_positional=True, sub_configs=True, skip={*declared, *groups_of(function)}
     )
-    flags = flags_of(function) - declared
-    values = parser.instantiate(parser.parse_args(_spelled_out([_underscored(a) for a in argv], flags)))
-    return with_groups(function, values)
-
-
-def _underscored(argument: str) -> str:
-    """--mm-per-unit is --mm_per_unit."""
-    if not argument.startswith("--"):
-        return argument
-    name, sign, value = argument[2:].partition("=")
-    return f"--{name.replace('-', '_')}{sign}{value}"
-
-
-def _spelled_out(argv: list[str], flags: set[str]) -> list[str]:
-    """--frames is --frames=true, --no_frames is --frames=false; `--frames false` stays as it is."""
-    spelled = []
-    for argument, following in pairwise([*argv, ""]):
-        name = argument.removeprefix("--")
-        if argument == f"--{name}" and name in flags and following not in ("true", "false"):
-            argument = f"--{name}=true"
-        elif argument == f"--no_{name.removeprefix('no_')}" and name.removeprefix("no_") in flags:
-            argument = f"--{name.removeprefix('no_')}=false"
-        spelled.append(argument)
-    return spelled
+    finish(parser, PAGES.get(verb, Page()))
+    return parser
 
 
 def _sorted(commands: dict[str, metadata.EntryPoint]) -> list[str]:

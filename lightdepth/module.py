@@ -36,15 +36,18 @@ class LightDepth(pl.LightningModule):
     """Trains a depth network. Hyper-parameters are plain values: checkpoints load without pickle.
 
     Args:
-        network: which network.
-        loss: weights of the loss terms.
-        learning_rate: the highest of the schedule.
-        weight_decay: of AdamW.
-        schedule: one_cycle (up, then down), cosine (down) or constant.
-        rows: image height it is trained at [pixels]; predictions are made at it.
-        pretrained: file of weights that others trained, for the encoder of unet or dpt (.safetensors or .pth).
-        start: checkpoint of ours to start from, by name or path, where its network has the same parts.
-        freeze_distance: only the uncertainty head learns; distance and albedo stay as they start.
+        network: Which network is trained.
+        loss: Weights of the loss terms, and the constants inside them.
+        learning_rate: Rate of AdamW at the top of the schedule, a number above 0. A higher one learns faster, and
+            less steadily.
+        weight_decay: Weight decay of AdamW, a share per step of the rate. A larger one keeps the network's weights
+            smaller.
+        schedule: How the rate changes over the run: one_cycle (up, then down), cosine (down) or constant.
+        rows: Height of the images that the network is trained at, pixels; predictions are made at it. A larger one
+            shows finer detail and takes longer.
+        pretrained: File of weights that others trained, for the encoder of unet or dpt (.safetensors or .pth).
+        start: Checkpoint of ours to start from, by name or path, where its network has the same parts.
+        freeze_distance: Whether only the uncertainty head learns; distance and albedo stay as they start.
     """
 
     def __init__(

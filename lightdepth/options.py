@@ -49,10 +49,3 @@ def with_groups(function: Callable[..., Any], values: Mapping[str, Any]) -> dict
         else values[name]
         for name in inspect.signature(function).parameters
     }
-
-
-def flags_of(function: Callable[..., Any]) -> set[str]:
-    """The names of all options that are true or false, but for dotted ones."""
-    named = {name: hint for name, hint in get_type_hints(function).items() if name != "return"}
-    of_groups = (get_type_hints(group) for group in groups_of(function).values())
-    return {name for hints in (named, *of_groups) for name, hint in hints.items() if hint is bool}

@@ -32,25 +32,24 @@ _RENEWED = 10
 
 @dataclass(frozen=True)
 class RefineConfig:
-    """How an image is refined.
-
-    Args:
-        steps: of Adam; 0 leaves the start as it is.
-        rows: height of the image that is worked on, pixels.
-        learning_rate: of the first step; it falls to zero along half a cosine.
-        levels: grids of corrections, each half as fine as the one before.
-        anchor: weight of |log t - log start|, which holds a good start where it is.
-        loss: weights of the terms.
-    """
+    """How an image is refined."""
 
     steps: int = 100
+    """Number of steps of Adam; 0 leaves the start as it is. More follow the light further and take longer."""
     rows: int = 64
+    """Height of the image that is worked on, pixels. A larger one corrects finer detail and takes longer."""
     learning_rate: float = 0.01
+    """Rate of the first step, in log distance; it falls to zero along half a cosine. A larger one moves farther in as
+    many steps."""
     levels: int = 6
+    """Number of grids of corrections, each half as fine as the one before. More move larger pieces of wall at
+    once."""
     anchor: float = 0.0
+    """Weight of |log t - log start|, which holds a good start where it is. A larger one holds it more firmly."""
     loss: LossConfig = field(
         default_factory=lambda: LossConfig(smoothness=50.0, cosine_exponent=0.3, chroma=0.0, reflectance=None)
     )
+    """Weights of the terms of the loss that is made small."""
 
     def __post_init__(self) -> None:
         if self.steps < 0 or self.rows < 8 or self.levels < 1 or self.anchor < 0 or self.learning_rate <= 0:

@@ -12,7 +12,7 @@ from verbs import by_options
 from videos import CAMERA, OCTAGON, picture, uneven_times, write_video
 
 from lightdepth.calibration import write_camera
-from lightdepth.cli import _spelled_out, main
+from lightdepth.cli import main, verb_parser
 from lightdepth.commands.import_frames import import_frames as import_frames_verb
 from lightdepth.datasets import FrameSequence, VideoFile, open_sequence, write_folder
 from lightdepth.datasets.sequence import border_mask
@@ -22,6 +22,7 @@ from lightdepth.image_quality import Measures, Meter, one_field
 from lightdepth.importing.overlay import find_overlay
 from lightdepth.importing.selection import BLURRED, FROZEN, KEPT, PASSED, UNREADABLE, Choice, selected
 from lightdepth.models import DeclineModel, predict
+from lightdepth.parsing import spelled
 
 import_frames = by_options(import_frames_verb)
 
@@ -351,8 +352,8 @@ def test_a_border_with_noise_text_and_a_dark_lumen_is_found_all_the_same(kind):
 
 def test_flags_may_be_given_bare():
     argv = ["--no_frames", "--keep_names", "--deinterlace", "false", "SRC", "--overwrite"]
-    spelled = _spelled_out(argv, {"frames", "keep_names", "deinterlace"})
-    assert spelled == ["--frames=false", "--keep_names=true", "--deinterlace", "false", "SRC", "--overwrite"]
+    words = spelled(verb_parser(import_frames_verb, "import"), argv)
+    assert words == ["--frames=false", "--keep_names=true", "--deinterlace", "false", "SRC", "--overwrite"]
 
 
 def test_the_sequence_that_is_read_is_one_of_ours(imported):

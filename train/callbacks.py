@@ -93,17 +93,17 @@ class Progress(pl.Callback):
 
 @dataclass(frozen=True)
 class DiagnosisConfig:
-    """When a run that goes nowhere is stopped.
-
-    Args:
-        patience: batches in a row with a loss or gradient that is no number, which are skipped until then.
-        blind: batches in a row without a usable pixel (all black or saturated).
-        constant: batches in a row in which distance is as good as constant although brightness is not.
-    """
+    """When a run that goes nowhere is stopped."""
 
     patience: int = 10
+    """Number of batches in a row with a loss or gradient that is no number, which are skipped, until the run is
+    stopped. More wait longer."""
     blind: int = 50
+    """Number of batches in a row without a usable pixel (all black or saturated) until the run is stopped. More wait
+    longer."""
     constant: int = 200
+    """Number of batches in a row in which distance is as good as constant although brightness is not, until the run
+    is stopped. More wait longer."""
 
 
 class Diagnosis(pl.Callback):

@@ -7,8 +7,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lightdepth.pages import PAGES
+
+from .trainer_options import TRAINER_OPTIONS
+
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
+
+    from lightdepth.parsing import Parser
 
 TRAINER_DEFAULTS = {
     "trainer.max_steps": 1500,
@@ -29,12 +35,14 @@ def train(argv: list[str] | None = None) -> int:
     """
     import lightning.pytorch as pl
 
+    from lightdepth.parsing import parsed
+
     from .datamodule import FrameDataModule
     from .fit import check_output, fit
 
     given = list(sys.argv[1:] if argv is None else argv)
     parser = training_parser()
-    config = parser.parse_args(_with_own_config(given))
+    config = parsed(parser, _with_own_config(given))
 
     output = Path(config.output)
     check_output(output, config.resume, config.overwrite)  # before the seconds that the rest takes
@@ -46,26 +54,24 @@ def train(argv: list[str] | None = None) -> int:
     return 0
 
 
-def training_parser() -> ArgumentParser:
+def training_parser() -> Parser:
     """Every option of a training run: of the model, its data, how it is watched, and Lightning's Trainer."""
     import lightning.pytorch as pl
-    from jsonargparse import ArgumentParser
 
     from lightdepth.module import LightDepth
+    from lightdepth.parsing import Parser, finish
 
     from .datamodule import FrameData
     from .fit import FitConfig
 
-    parser = ArgumentParser(
-        prog="lightdepth train", description="Train LightDepth without ground truth.", allow_abbrev=False
-    )
-    parser.add_argument(
-        "--config", action="config", help="YAML with any of the options below, e.g. configs/train/*.yaml"
-    )
-    parser.add_argument("-o", "--output", required=True, help="folder of the run")
-    parser.add_argument("--resume", action="store_true", help="go on from OUTPUT/checkpoints/last.ckpt")
-    parser.add_argument("--overwrite", action="store_true", help="replace a run that is already there")
-    parser.add_argument("--seed", type=int, default=0, help="of weights, colons, order and augmentation")
+    summary = "Train a depth network on frames alone, from the decline of the light."
+    parser = Parser(prog="lightdepth train", description=summary, allow_abbrev=False)
+    parser.add_argument("--config", action="config")
+    parser.add_argument("-o", "--output", required=True, help="Folder of the run, with its checkpoints and its model.")
+    parser.add_argument("--resume", action="store_true", help="Go on from the run's own checkpoints/last.ckpt.")
+    parser.add_argument("--overwrite", action="store_true", help="Replace a run that is already there.")
+    seed = "Number that draws weights, colons, order and augmentation. Another one makes another run."
+    parser.add_argument("--seed", type=int, default=0, help=seed)
     parser.add_class_arguments(LightDepth, "model")
     parser.add_class_arguments(FrameData, "data")
     parser.add_class_arguments(FitConfig, "fit")
@@ -73,6 +79,11 @@ def training_parser() -> ArgumentParser:
     parser.link_arguments("seed", "data.seed")
     parser.link_arguments("data.size", "model.rows", compute_fn=lambda size: size[1])
     parser.set_defaults(TRAINER_DEFAULTS)
+    for action in parser._actions:
+        action.help = TRAINER_OPTIONS.get(action.dest, action.help)
+    assert parser.groups is not None
+    parser.groups["trainer"].title = "Lightning's Trainer"
+    finish(parser, PAGES["train"])
     return parser
 
 

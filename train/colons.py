@@ -9,41 +9,41 @@ import numpy as np
 import torch
 
 from lightdepth.frame import FrameBatch, to_batch
+from lightdepth.tube.path import Lens
 from lightdepth.tube.scene import TubeConfig
 
 
 @dataclass(frozen=True)
 class TubeData:
-    """Synthetic colons for training, drawn from the data's seed; validation scenes are others.
-
-    Args:
-        scenes: colons to train on, each with its own shape, texture and endoscope; 0 for none.
-        val_scenes: colons to validate on.
-        frames: per colon.
-        travel: mm along the colon over which its frames are spread.
-        lenses: in turn: c3vd, fisheye, pinhole, telescope.
-        mu: ends of the range of the light's spread.
-        gamma: ends of the range of the response.
-        reflectance: ends of the range of the wall's reflectance.
-        family: plain, realistic (polyps, mucus, motion blur and all else: lightdepth.tube.realistic), or mixed: one
-            scene of five is no colon but a hollow looked at from anywhere (lightdepth.tube.cavity), and every scene
-            has a field of view of its own.
-        scene: ranges of one's own instead of the family's; mu, gamma and reflectance above hold in any case.
-        device: to render on: auto (the GPU where there is one and the extra gpu is installed), cpu or cuda. The same
-            colons on any, up to rounding.
-    """
+    """Synthetic colons for training, drawn from the data's seed; validation scenes are others."""
 
     scenes: int = 0
+    """Number of colons to train on, each with its own shape, texture and endoscope; 0 for none. More make a network
+    that knows more, and take longer to render."""
     val_scenes: int = 0
+    """Number of colons to validate on, others than those of the training. More judge more surely and take longer."""
     frames: int = 8
+    """Number of frames of each colon. More take longer to render."""
     travel: float = 60.0
-    lenses: tuple[str, ...] = ("c3vd", "fisheye", "pinhole")
+    """Length of colon over which the frames are spread, mm. A longer one makes neighbouring frames less alike."""
+    lenses: tuple[Lens, ...] = ("c3vd", "fisheye", "pinhole")
+    """Lenses that the colons have in turn: c3vd, fisheye, pinhole or telescope."""
     mu: tuple[float, float] = (0.0, 3.5)
+    """Ends of the range of the exponent mu of the light's spread. A larger one makes a narrower light."""
     gamma: tuple[float, float] = (1.8, 2.6)
+    """Ends of the range of the exponent gamma of the camera's response. A larger one brightens dark parts more."""
     reflectance: tuple[float, float] = (0.0, 0.7)
+    """Ends of the range of the share of light that the wall throws back on other wall. A larger one makes more
+    indirect light."""
     family: Literal["plain", "realistic", "mixed"] = "plain"
+    """Kind of colons: plain; realistic, with polyps, mucus, motion blur and all else (lightdepth.tube.realistic); or
+    mixed, where one scene of five is no colon but a hollow looked at from anywhere (lightdepth.tube.cavity), and
+    every scene has a field of view of its own."""
     scene: TubeConfig | None = None
+    """Ranges of one's own instead of the family's; mu, gamma and reflectance above hold in any case."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where colons are rendered: cpu, cuda, or auto, the GPU where there is one and the extra gpu is installed. The
+    colons are the same on any, up to rounding."""
 
 
 _MAX_REFLECTANCE = 0.95

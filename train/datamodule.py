@@ -34,46 +34,49 @@ class FrameData:
     """Which frames are trained and validated on, and how they are shown to the network."""
 
     sequences: list[str] | None = None
-    """folders of frames to train on"""
+    """Folders of frames, or videos, to train on."""
     val_sequences: list[str] | None = None
-    """folders to validate on; without any, the end of each training sequence is held out"""
+    """Folders to validate on; without any, the end of each training sequence is held out."""
     split: str | None = None
-    """split file (data/*/splits/*.yaml) in place of both; its train and val are read, its test never is"""
+    """Split file (data/*/splits/*.yaml) in place of both; its train and val are read, its test never is."""
     root: str | None = None
-    """folder that holds the split's sequences"""
+    """Folder that holds the sequences of the split."""
     frames: str | None = None
-    """file with one frame name a line, as `select` writes it; training takes exactly these, and what is held out to
-    validate on comes from them. `folder/name` where several sequences have frames of one name"""
+    """File with one frame name a line, as `select` writes it; training takes exactly these, and what is held out to
+    validate on comes from them. `folder/name` where several sequences have frames of one name."""
     format: str | None = None
-    """format of the sequences: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if
-    left out"""
+    """Format of the sequences: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking
+    if left out."""
     camera: str | None = None
-    """calibration file of all the sequences, which wins over their own"""
+    """Calibration file of all the sequences, which wins over their own."""
     light: str | None = None
-    """light.json, photometric XML, or gamma=2.2,mu=0, of all the sequences, which wins over their own"""
+    """Light of all the sequences, which wins over their own: light.json, photometric XML, or gamma=2.2,mu=0."""
     mask: str | None = None
-    """image, white where tissue shows, of all the sequences, which wins over their own"""
+    """Image, white where tissue shows, for all the sequences; it wins over their own."""
     held_out: float = 0.1
-    """share of each training sequence, at its end, to validate on where there are no validation sequences"""
+    """Share of each training sequence, at its end, to validate on where there are no validation sequences. A larger
+    one judges more surely and trains on less."""
     tube: TubeData = _NO_TUBE
-    """synthetic colons to train on, besides the sequences or alone"""
+    """Synthetic colons to train and validate on, besides the sequences or alone."""
     halves: bool = False
-    """every batch holds frames of the sequences first, then as many (or one less) of the synthetic colons"""
+    """Whether every batch holds frames of the sequences first, then as many (or one less) of the synthetic colons."""
     size: tuple[int, int] = (160, 128)
-    """width and height of the images, pixels"""
+    """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
     batch_size: int = 4
-    """number of frames in a step"""
+    """Number of frames in a step. More make steadier steps and take more time and memory."""
     num_workers: int = 0
-    """number of processes that read frames"""
+    """Number of processes that read frames; 0 reads them in the main one. More read faster, as far as there are
+    cores."""
     augment: bool = True
-    """draw exposure and flips anew at every step"""
+    """Whether exposure is varied and images are flipped at random."""
     reflectance_error: float = 0.0
-    """added to what is known of each wall's reflectance: what a wrong calibration costs"""
+    """Share added to what is known of each wall's reflectance, to see what a wrong calibration costs. A larger one
+    makes it more wrong."""
     random_reflectance: tuple[float, float] | None = None
-    """ends of a range from which each image's reflectance is drawn anew at every step, whatever is known of it: for
-    networks that have it as an input and are to obey it"""
+    """Ends of a range, shares in [0, 1), from which each image's reflectance is drawn anew at every step, whatever is
+    known of it: for networks that have it as an input and are to obey it. A larger one means more indirect light."""
     seed: int = 0
-    """number that draws colons, order and augmentation"""
+    """Number that draws colons, order and augmentation. Another one makes another run."""
 
     def __post_init__(self) -> None:
         if self.random_reflectance is not None:

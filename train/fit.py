@@ -52,20 +52,19 @@ _PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mi
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How a run is watched, averaged and stopped.
-
-    Args:
-        ema: decay of the running average of the weights, which is then what is validated and exported; 0 for none.
-        monitor: what `best` and early stopping go by, on the validation frames; it needs no truth: the whole loss,
-            its photometric term, or how much distance changes in a mirror and in less light; "last" chooses nothing.
-        patience: validations without improvement after which the run ends; 0 for never.
-        diagnosis: when a run that goes nowhere is stopped.
-    """
+    """How a run is watched, averaged and stopped."""
 
     ema: float = 0.0
+    """Decay of the running average of the weights, a share in [0, 1), which is then what is validated and exported; 0
+    for none. A larger one averages over more steps."""
     monitor: Literal["loss", "photometric", "inconsistency", "last"] = "loss"
+    """What `best` and early stopping go by, on the validation frames; it needs no truth: the whole "loss", its
+    "photometric" term, or the "inconsistency", how much distance changes in a mirror and in less light; "last"
+    chooses nothing."""
     patience: int = 0
+    """Number of validations without improvement after which the run ends; 0 for never. More wait longer."""
     diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
+    """When a run that goes nowhere is stopped."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.ema < 1 or self.patience < 0:

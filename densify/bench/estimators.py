@@ -49,10 +49,15 @@ class EstimatorsConfig:
     """Shares of wrong points, their kinds, points per keyframe, and keyframes drawn for each combination."""
 
     shares: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6)
+    """Shares of wrong points, each judged on its own. More shares take longer."""
     kinds: tuple[Kind, ...] = ("uniform", "clustered", "depth")
+    """Kinds of wrong points: uniform, clustered, depth."""
     points: tuple[int, ...] = (20, 100, 500)
+    """Numbers of points per keyframe, each judged on its own. More numbers take longer."""
     draws: int = 50
+    """Number of keyframes drawn for each combination. More make the figures more certain and take longer."""
     seed: int = 0
+    """Number that draws the keyframes and their points. Another one draws others."""
 
     def __post_init__(self) -> None:
         if not self.shares or not all(0 <= share < 1 for share in self.shares):

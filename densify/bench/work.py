@@ -35,17 +35,25 @@ IMAGE_SIZE: dict[Size, tuple[int, int]] = {"small": (160, 128), "full": (320, 25
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """What is measured. `densify` holds for all dense rows but for its recipe; the screening, ten times as long as the
-    others, is judged at one share of wrong points only."""
+    """What the benchmark measures."""
 
     size: Size = "small"
+    """How much is measured: small, or full, with more and longer sequences and a screening."""
     first_seed: int = 400
+    """Number that seeds the first scene; the others count on from it. Another one draws other colons."""
     wrong_shares: tuple[float, ...] = SHARES["small"]
+    """Shares of wrong map points, each a SLAM export of its own. More shares take longer."""
     screening_share: float = 0.3
+    """Share of wrong map points of the screening, which is ten times as long as the other scenes and so is judged at
+    one share only. A larger one makes it harder."""
     checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT)
+    """Models to compare: paths, names of bundled ones, decline (the closed form) or constant."""
     recipes: tuple[Recipe, ...] = ("paper", "full")
+    """Ways to make dense maps that are compared: paper, full, or both."""
     image_size: tuple[int, int] = IMAGE_SIZE["small"]
+    """Width and height of the keyframes, pixels. A larger one takes longer."""
     densify: DensifyConfig = field(default_factory=lambda: DensifyConfig(withhold=0.0))
+    """How dense maps are made, for all dense rows but for their recipe."""
 
     def __post_init__(self) -> None:
         for name in ("wrong_shares", "checkpoints", "recipes"):

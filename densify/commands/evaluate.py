@@ -45,15 +45,17 @@ class TruthSource:
     """What is judged against, and how it is read."""
 
     truth: Path | None = None
-    """sequence with true depth, and for maps with true poses; left out, a densify run's withheld points judge"""
+    """Sequence with true depth, and for maps with true poses; left out, a densify run's withheld points judge."""
     format: str | None = None
-    """format of the truth: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found if left out"""
+    """Format of the truth: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if
+    left out."""
     camera: Path | None = None
-    """calibration file that wins over the truth's"""
+    """Calibration file that wins over the truth's own."""
     mask: Path | None = None
-    """image, white where tissue shows, that wins over the truth's"""
+    """Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one."""
     truth_mesh: Path | None = None
-    """true surface, mm, in the frame of the true poses; left out, C3VD's own or triangulated true depth"""
+    """File of the true surface, mm, in the frame of the true poses; left out, C3VD's own or triangulated true
+    depth."""
 
     def sequence(self, folder: Path) -> SequenceSource:
         """A folder of the truth: itself, or one of its sequences."""
@@ -65,13 +67,15 @@ class JudgingConfig:
     """How errors are taken."""
 
     mm_per_unit: float | None = None
-    """millimetres per map unit, where known: the error after SE(3) needs it"""
+    """Millimetres per map unit, where known: the error after SE(3) needs it. A larger one makes a larger surface."""
     thresholds_mm: tuple[float, ...] = THRESHOLDS_MM
-    """distances [mm] of precision, recall and F-score"""
+    """Distances, mm, up to which a point counts as right in precision, recall and F-score. Larger ones count more
+    points."""
     max_depth_mm: float = 100.0
-    """true depth [mm] beyond which a pixel takes no part in the errors of depth"""
+    """True depth, mm, beyond which pixels take no part in the errors of depth. A larger one judges farther wall
+    too."""
     common: bool = False
-    """judge the frames that both sides have, where there are others"""
+    """Judge only the frames that both sides have, where there are others."""
 
     def __post_init__(self) -> None:
         check_unit(self.mm_per_unit)

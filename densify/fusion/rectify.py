@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -30,16 +31,28 @@ FULL = 255
 class RectifyConfig:
     """Which predicted pixels are handed to the fusion, how finely, and with what weight."""
 
-    focal_px: float = 256.0  # pixels per radian at most; finer images are merged, block by block
-    field: str = "whole"  # or pinhole: only what an undistorted pinhole image of the same size would hold
-    # Log distance per radian above which the surface is lost from sight, an edge or nearly along the ray (5.7 degrees
-    # at 10): left out, on both sides, because what lies between is a mixture that would become a curtain. Smaller makes
-    # what is there more accurate and leaves more out.
+    focal_px: float = 256.0
+    """Finest resolution that is fused, pixels per radian; finer images are merged block by block. A larger one keeps
+    more detail and takes longer."""
+    field: Literal["whole", "pinhole"] = "whole"
+    """Which pixels are fused: whole takes all that the lens shows, pinhole only what an undistorted pinhole image of
+    the same size would hold."""
     max_slope: float = 10.0
-    dark: float = 0.02  # brightest channel below this: too dark to tell; the weight falls to `unlit`
-    bright: float = 0.98  # brightest channel above this: clipped; the weight falls to `unlit`
-    unlit: float = 0.5  # weight of a pixel in the dark or clipped; less was tried and made surfaces a little worse
-    sigma: float = 0.15  # uncertainty of log distance at which the weight has halved
+    """Change of log distance per radian above which a pixel is left out, because the surface there is an edge or seen
+    nearly along the ray (5.7 degrees at 10). What lies between the two sides of an edge is a mixture that would
+    become a curtain. A larger one keeps more of the wall, less accurately."""
+    dark: float = 0.02
+    """Brightness of the brightest channel, in [0, 1], below which a pixel's weight falls towards `unlit`, because it
+    is too dark to tell. A higher one trusts dark pixels less."""
+    bright: float = 0.98
+    """Brightness of the brightest channel, in [0, 1], above which a pixel's weight falls towards `unlit`, because it
+    is clipped. A higher one trusts bright pixels more."""
+    unlit: float = 0.5
+    """Weight of a black or clipped pixel; a well-lit one has 1. A larger one trusts such pixels more; less than 0.5
+    was tried and made surfaces a little worse."""
+    sigma: float = 0.15
+    """Uncertainty of a pixel, as standard deviation of log distance, at which its weight has halved. A larger one
+    trusts uncertain pixels more."""
 
     def __post_init__(self) -> None:
         if self.field not in ("whole", "pinhole"):

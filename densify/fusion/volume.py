@@ -32,11 +32,21 @@ _SPARSE = 4  # every so many pixels are enough to find the blocks
 class FusionConfig:
     """Resolution and reach of the surface."""
 
-    voxel: float | None = None  # map units; by default a typical observed distance over voxels_per_distance
+    voxel: float | None = None
+    """Edge of a voxel, map units; left out, a typical observed distance over voxels_per_distance. A larger one makes
+    a coarser surface, sooner."""
     voxels_per_distance: float = 52.0
-    truncation: float = 6.0  # voxels
-    min_views: int = 1  # a surface voxel must be seen by at least this many views
-    far: float = 2.0  # predictions beyond far times the 90th percentile of a keyframe's inlier distances are left out
+    """Number of voxels in a typical observed distance, which sets their size where `voxel` does not. More make a
+    finer surface and take more time and memory."""
+    truncation: float = 6.0
+    """Distance from the surface at which signed distances are cut off, voxels. A larger one smooths more noise away,
+    and more thin folds with it."""
+    min_views: int = 1
+    """Least number of keyframes that must have seen a piece of surface for it to be kept. More leave out what few
+    have seen."""
+    far: float = 2.0
+    """Multiple of the 90th percentile of a keyframe's inlier distances beyond which its predictions are left out. A
+    larger one reaches farther, where depth is worse."""
 
     def voxel_for(self, submap: Submap) -> float:
         """The size of a voxel, in map units."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from densify.similarity import Similarity
 from lightdepth.errors import InputError
 
-WAYS = ("points", "frames", "looks", "surface")
+Way = Literal["points", "frames", "looks", "surface"]
+WAYS: tuple[Way, ...] = get_args(Way)
 """What two submaps may have in common, as densify.joining says it."""
 
 
@@ -15,28 +17,64 @@ WAYS = ("points", "frames", "looks", "surface")
 class MergeConfig:
     """When two submaps are one. Lengths on the surface are shares of the reach."""
 
-    # What to join by, in this order. "surface", by shape alone, has to be asked for: chance can join what is apart.
-    by: tuple[str, ...] = ("points", "frames", "looks")
-    min_agreeing: int = 12  # correspondences
-    min_share: float = 0.2  # of the correspondences of points and frames; 30 % wrong points in both maps leave 40 %
-    min_alike_share: float = 0.1  # of the points that look alike, most of which only do so
-    tolerance: float = 0.05  # correspondences agree within this share of the distance from the camera
-    trials: int = 5000  # triples of correspondences tried
-    same_pixel: float = 1.0  # px between two observations of one point
-    max_turn_deg: float = 5.0  # between the two poses of a shared frame, median
-    max_shift: float = 0.1  # the same for their places
-    max_size_ratio: float = 3.0  # of the reaches, where no frame is shared
-    size_ratios: tuple[float, ...] = (1.0, 0.7, 1.4)  # of the reaches, tried in turn by surface
-    max_pairs: int = 60  # submaps compared by looks, and by surface; the nearest in time first
-    grain: float = 0.06  # spacing of the points by which shapes are compared
-    feature_radius: float = 0.25  # of an FPFH feature
-    max_gap: float = 0.2  # between joined surfaces along common rays, median; their own errors are in it
-    max_shape_gap: float = 0.05  # the same after joining by shape, which leaves less
-    max_through: float = 0.15  # share of rays to one surface in whose way the other stands
-    min_overlap: float = 0.3  # share of the rays of a camera that must meet both surfaces
-    min_shape_share: float = 0.15  # of the features that must agree after joining by shape; chance gives 5 % at most
-    # Or else the correlation of the finer colours; chance gives 0.06 at most, 2 degrees off no more.
+    by: tuple[Way, ...] = ("points", "frames", "looks")
+    """What submaps may be joined by, tried in this order: points, frames, looks and surface. "surface", the shape
+    alone, has to be asked for: chance can join what is apart."""
+    min_agreeing: int = 12
+    """Least number of correspondences that must agree on a join. More refuse more joins."""
+    min_share: float = 0.2
+    """Least share of the correspondences of points and frames that must agree; 30 % wrong points in both maps leave
+    40 %. A larger one refuses more joins."""
+    min_alike_share: float = 0.1
+    """Least share of the points that look alike that must agree; most of these only look alike. A larger one refuses
+    more joins."""
+    tolerance: float = 0.05
+    """Distance up to which correspondences agree, as a share of that from the camera. A larger one joins less exact
+    maps, and wrong ones sooner."""
+    trials: int = 5000
+    """Number of triples of correspondences tried. More find a join among more wrong correspondences and take
+    longer."""
+    same_pixel: float = 1.0
+    """Distance up to which two observations are of one point, pixels. A larger one finds more common points, wrong
+    ones among them."""
+    max_turn_deg: float = 5.0
+    """Largest angle between the two poses of a shared frame, the median over them, degrees. A larger one refuses
+    fewer joins."""
+    max_shift: float = 0.1
+    """Largest distance between the two places of a shared frame, the median over them, as a share of the reach. A
+    larger one refuses fewer joins."""
+    max_size_ratio: float = 3.0
+    """Largest factor between the scale of a join and the ratio of the two reaches, where no frame is shared. A larger
+    one lets looks join maps that see wall at more different distances."""
+    size_ratios: tuple[float, ...] = (1.0, 0.7, 1.4)
+    """Ratios of the two reaches that are tried in turn by surface. More of them find submaps of more different size
+    and take longer."""
+    max_pairs: int = 60
+    """Number of pairs of submaps compared by looks, and by surface, the nearest in time first. More find more joins
+    and take longer."""
+    grain: float = 0.06
+    """Spacing of the points by which shapes are compared, as a share of the reach. A larger one is coarser and
+    faster."""
+    feature_radius: float = 0.25
+    """Radius of an FPFH feature of the shape, as a share of the reach. A larger one tells more places apart, of
+    larger surfaces only."""
+    max_gap: float = 0.2
+    """Largest median gap between joined surfaces along common rays, as a share of the distance; their own errors are
+    in it. A larger one refuses fewer joins."""
+    max_shape_gap: float = 0.05
+    """Largest median gap after joining by shape, which leaves less, as a share of the distance. A larger one refuses
+    fewer joins."""
+    max_through: float = 0.15
+    """Largest share of the rays to one surface in whose way the other stands. A larger one refuses fewer joins."""
+    min_overlap: float = 0.3
+    """Least share of a camera's rays to its own surface that must meet the other one too, for that camera to judge
+    the join. A larger one judges by fewer cameras, and refuses more joins."""
+    min_shape_share: float = 0.15
+    """Least share of the features that must agree after joining by shape; by chance 5 % do at most. A larger one
+    refuses more joins."""
     min_likeness: float = 0.1
+    """Least correlation of colour detail that is enough on its own, in [0, 1]. By chance it reaches 0.06; a pose 2
+    degrees off reaches no more. A larger one refuses more joins."""
 
     def __post_init__(self) -> None:
         unknown = set(self.by) - set(WAYS)

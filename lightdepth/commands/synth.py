@@ -25,21 +25,22 @@ class ColonConfig:
     """A synthetic colon, the endoscope in it, and the way that it takes."""
 
     lens: str = "c3vd"
-    """lens of the endoscope: pinhole, fisheye or c3vd"""
+    """Lens of the endoscope: pinhole, telescope, fisheye or c3vd."""
     frames: int = 40
-    """number of frames along the way"""
+    """Number of frames to render. More make a longer sequence and take longer."""
     size: tuple[int, int] = (320, 256)
-    """width and height of the images, pixels"""
+    """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
     seed: int = 0
-    """number that draws the colon, its light and the path"""
+    """Number that draws the colon, its light and the path. Another one draws another colon."""
     travel_mm: float = 30.0
-    """length of the path, mm"""
+    """Length of the path along the colon, mm. A longer one makes neighbouring frames less alike."""
     light: str | None = None
-    """light.json or gamma=2.2,mu=0 to have instead of a drawn light"""
+    """Light to have instead of a drawn one: light.json, or gamma=2.2,mu=0."""
     family: Literal["plain", "realistic"] = "plain"
-    """plain (the tube, its folds and its light) or realistic (with all that real images have)"""
+    """Kind of colon: plain (the tube, its folds and its light) or realistic (with all that real images have)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """device to render on: auto (the GPU where there is one and the extra gpu is installed), cpu or cuda"""
+    """Where the frames are rendered: cpu, cuda, or auto, the GPU where there is one and the extra gpu is
+    installed."""
 
     def __post_init__(self) -> None:
         if self.frames < 1:

@@ -15,15 +15,16 @@ class SequenceSource:
     """Frames, and the files that win over what lies beside them."""
 
     data: Path
-    """folder of frames, or a video"""
+    """Folder of frames, or a video, of any format that is read."""
     format: str | None = None
-    """folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if left out"""
+    """Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if
+    left out."""
     camera: Path | None = None
-    """calibration file that wins over the folder's; left out, also the map's own camera is taken where there is none"""
+    """Calibration file, which wins over the folder's own; left out, the folder's, else the map's."""
     light: str | None = None
-    """light.json, photometric XML, or gamma=2.2,mu=0, that wins over the folder's"""
+    """Light of the endoscope, which wins over the folder's own: light.json, photometric XML, or gamma=2.2,mu=0."""
     mask: Path | None = None
-    """image, white where tissue shows, that wins over the folder's"""
+    """Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one."""
 
     def open(self, map_camera: CameraModel | None = None) -> FrameSequence:
         """The frames; `map_camera` as for open_sequence. Raises InputError where they cannot be read."""

@@ -33,11 +33,11 @@ class PictureConfig:
     """How pictures are cut, resized and freed of interlacing."""
 
     size: tuple[int, int] | None = None
-    """width and height to resize to, pixels; the camera is rescaled"""
+    """Width and height to resize the frames to, pixels; the camera is rescaled. A larger one keeps finer detail."""
     crop: Literal["none", "auto"] = "none"
-    """none, or auto: cuts the black border off, and the camera with it"""
+    """Whether the black border is cut off: none, or auto, which crops the camera as well."""
     deinterlace: bool = False
-    """keep one field and interpolate the rows between"""
+    """Keep one field of each frame and interpolate the rows between."""
 
     def __post_init__(self) -> None:
         if self.size is not None and min(self.size) < 1:

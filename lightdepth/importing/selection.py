@@ -20,17 +20,21 @@ class Choice:
     """Which frames to keep."""
 
     rate: float | None = None
-    """frames per second to keep, the sharpest of each interval; left out, 5 for a video, all of a folder"""
+    """Number of frames per second to keep, the sharpest of each interval; left out, 5 for a video, all of a folder.
+    More keep more frames."""
     every: int | None = None
-    """number n: keep every n-th frame instead"""
+    """Number of frames from one that is kept to the next, instead of a rate. More keep fewer frames."""
     start: float = 0.0
-    """seconds from the first frame at which the part to keep begins"""
+    """Time of the first frame to keep, seconds from the first frame. A larger one leaves out more at the
+    beginning."""
     end: float | None = None
-    """seconds from the first frame at which the part to keep ends; left out, the last frame"""
+    """Time of the last frame to keep, seconds from the first frame; left out, all are kept. A larger one leaves out
+    less at the end."""
     blur: float = 0.6
-    """share of the neighbours' sharpness below which a frame is left out as blurred; 0 keeps all"""
+    """Share of its neighbours' sharpness below which a frame is left out as blurred; 0 keeps all. A larger one leaves
+    out more frames."""
     max_frames: int | None = None
-    """number of frames to keep at most, spread evenly"""
+    """Largest number of frames to keep, spread evenly over the rest. More keep more frames."""
 
     def __post_init__(self) -> None:
         if self.end is not None and self.end <= self.start:

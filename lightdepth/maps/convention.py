@@ -27,13 +27,17 @@ SIDECAR = "densify_map.json"
 class MapConvention:
     """How to read one map's files."""
 
-    pixel_center: float = (
-        0.5  # coordinate of the first pixel's centre, of keypoints and principal point alike: 0.0 or 0.5
-    )
-    pose_convention: str = "w2c"  # direction of the poses in images.txt: "w2c" camera-from-map, "c2w" map-from-camera
-    keypoints: str = "distorted"  # "undistorted": keypoints as a pinhole camera of the same K would see them
-    frame_offset: int = 0  # added to the number in a keyframe's name, where names do not count as the frames do
-    fps: float | None = None  # frames per second, where a keyframe has a time and no number
+    pixel_center: float = 0.5
+    """Coordinate of the first pixel's centre, of keypoints and principal point alike, pixels: 0.0 or 0.5."""
+    pose_convention: Literal["w2c", "c2w"] = "w2c"
+    """Direction of the poses in images.txt: "w2c" is camera-from-map, "c2w" map-from-camera."""
+    keypoints: Literal["distorted", "undistorted"] = "distorted"
+    """Where keypoints are: "distorted", where the lens put them, or "undistorted", as a pinhole camera of the same K
+    would see them."""
+    frame_offset: int = 0
+    """Number added to that in a keyframe's name, where names do not count as the frames do."""
+    fps: float | None = None
+    """Frames per second, where a keyframe has a time and no number."""
 
     def from_ours(self, camera: CameraModel) -> CameraModel:
         """A camera in our pixels, brought to the map's: the inverse of what `keyframe` does to it."""

@@ -25,6 +25,8 @@ from lightdepth.network.tiny import TinyUNet
 from lightdepth.network.unet import ResNetUNet
 from lightdepth.photometry import LightTerms
 
+Input = Literal["rgb", "closed_form", "ray_z", "mask", "reflectance"]
+Encoder = Literal["resnet18", "resnet34", "resnet50", "vitt14", "vits14", "vitb14", "vitl14"]
 KINDS = ("tiny", "unet", "dpt")
 ENCODERS = {"tiny": (), "unet": tuple(unet.ENCODERS), "dpt": tuple(dpt.ENCODERS)}
 _DEFAULT_ENCODER = {"unet": "resnet18", "dpt": "vits14"}
@@ -32,29 +34,28 @@ _DEFAULT_ENCODER = {"unet": "resnet18", "dpt": "vits14"}
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Which network. Plain values, so that it travels as JSON inside a checkpoint.
-
-    Args:
-        kind: "tiny" (0.5 M parameters), "unet" (ResNet encoder) or "dpt" (vision transformer, extra `dpt`).
-        inputs: channels that go in, of rgb, closed_form, ray_z, mask, reflectance.
-        output: "residual" (a correction of the closed form) or "absolute" (log distance itself), both with its scale;
-            or "free" (log distance with a scale of its own, for losses with a fixed gain).
-        encoder: of unet resnet18 (14 M), resnet34, resnet50; of dpt vits14 (25 M), vitb14, vitl14, vitt14; null takes
-            the first.
-        uncertainty: a head of its own for the standard deviation of log distance.
-        width: channels of the tiny network's first level.
-        norm: normalisation of the tiny network, "batch" or "group".
-        blur: width of the blur of the closed form that goes in, as a share of the image height.
-    """
+    """Which network. Plain values, so that it travels as JSON inside a checkpoint."""
 
     kind: Literal["tiny", "unet", "dpt"] = "tiny"
-    inputs: tuple[str, ...] = ("rgb", "closed_form", "ray_z")
+    """Which network: "tiny" (0.5 M parameters), "unet" (ResNet encoder) or "dpt" (vision transformer, extra
+    `dpt`)."""
+    inputs: tuple[Input, ...] = ("rgb", "closed_form", "ray_z")
+    """Channels that go into the network: some of rgb, closed_form, ray_z, mask and reflectance."""
     output: Literal["residual", "absolute", "free"] = "residual"
-    encoder: str | None = None
+    """What the network says: "residual" (a correction of the closed form) or "absolute" (log distance itself), both
+    with its scale; or "free" (log distance with a scale of its own, for losses with a fixed gain)."""
+    encoder: Encoder | None = None
+    """Encoder of the network: for unet resnet18 (14 M), resnet34 or resnet50; for dpt vits14 (25 M), vitb14, vitl14
+    or vitt14. null takes resnet18 and vits14."""
     uncertainty: bool = False
+    """Whether the network has a head of its own for the standard deviation of log distance."""
     width: int = 16
+    """Number of channels of the tiny network's first level. More make a stronger and slower network."""
     norm: Literal["batch", "group"] = "group"
+    """Normalisation of the tiny network: over the "batch", or over a "group" of channels."""
     blur: float = 0.018
+    """Width of the blur of the closed form that goes in, as a share of the image height. A larger one hides more of
+    its texture from the network."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", tuple(self.inputs))  # JSON has lists

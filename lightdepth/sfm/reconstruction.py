@@ -51,22 +51,48 @@ _ADVICE = (
 class SfmConfig:
     """How frames are mapped."""
 
-    max_features: int = 4096  # SIFT features per frame, the strongest ones
-    peak_threshold: float = 0.003  # least contrast of a feature, in [0, 1]; COLMAP's 0.0067 misses smooth tissue
-    mask_erosion_px: int = 4  # how far features keep from the border of the mask, pixels
-    highlight: float = 0.98  # a pixel whose three channels all reach this, in [0, 1], is a highlight
-    highlight_margin_px: int = 3  # how far features keep from a highlight, pixels
-    contrast: float = 2.0  # clip limit of CLAHE, which evens the contrast of dark and bright tissue; 0: as it is
-    matching: Literal["auto", "sequential", "exhaustive"] = "auto"  # auto: exhaustive for few frames
-    exhaustive_up_to: int = 40  # frames; with `auto`, longer sequences are matched sequentially
-    overlap: int = 10  # frames matched ahead of each, when sequential
-    alike: int = 5  # frames matched with each besides, when sequential: those farther off that look most alike
-    min_model_size: int = 3  # frames in the smallest submap
-    min_points: int = 8  # points in the smallest submap
-    init_min_tri_angle: float = 4.0  # least angle between the rays of the first pair, degrees
-    init_min_num_inliers: int = 50  # matches that the first pair needs
-    num_threads: int = 1  # more threads change the last bits from run to run, and were not faster on two cores
-    seed: int = 0  # of every RANSAC in it
+    max_features: int = 4096
+    """Largest number of SIFT features in a frame; the strongest ones are taken. More find more points and take
+    longer."""
+    peak_threshold: float = 0.003
+    """Least contrast of a feature, in [0, 1]; COLMAP's 0.0067 misses smooth tissue. A higher one finds fewer
+    features."""
+    mask_erosion_px: int = 4
+    """Distance that features keep from the border of the mask, pixels. A larger one leaves out more of the image."""
+    highlight: float = 0.98
+    """Brightness, in [0, 1], which all three channels of a pixel reach in a highlight. A higher one takes fewer
+    pixels for highlights."""
+    highlight_margin_px: int = 3
+    """Distance that features keep from a highlight, pixels. A larger one leaves out more of the image."""
+    contrast: float = 2.0
+    """Clip limit of CLAHE, a factor, which evens the contrast of dark and bright tissue; 0 leaves it as it is. A
+    larger one brings out more, noise included."""
+    matching: Literal["auto", "sequential", "exhaustive"] = "auto"
+    """Which frames are matched: sequential, those that follow each other or look alike; exhaustive, all with all;
+    auto, exhaustive for few frames."""
+    exhaustive_up_to: int = 40
+    """Number of frames up to which `auto` matches all with all; longer sequences are matched sequentially. More find
+    more connections, in time that grows with their square."""
+    overlap: int = 10
+    """Number of frames matched ahead of each, when sequential. More bridge longer gaps and take longer."""
+    alike: int = 5
+    """Number of frames matched with each besides, when sequential: those farther off that look most alike. More close
+    more loops and take longer."""
+    min_model_size: int = 3
+    """Least number of frames in a submap. More leave out small submaps."""
+    min_points: int = 8
+    """Least number of points in a submap. More leave out poor submaps."""
+    init_min_tri_angle: float = 4.0
+    """Least angle between the rays of the first pair of frames, degrees. A larger one starts from a safer pair, where
+    there is one."""
+    init_min_num_inliers: int = 50
+    """Least number of matches that the first pair of frames needs. More start from a safer pair, where there is
+    one."""
+    num_threads: int = 1
+    """Number of threads for features, matches and mapping. More change the last bits from run to run, and were not
+    faster on two cores."""
+    seed: int = 0
+    """Number that draws the samples of every RANSAC in it. Another one makes a slightly different map."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,13 @@ import numpy as np
 
 from lightdepth.image_quality import Measures
 
+# What is below or above these is given as the reason. They choose words and change no map: nobody would set them.
+_DARK = 25.0  # mean of the brightest channel, 0..255
+_SATURATED = 0.4  # share of white pixels
+_BLURRED = 0.5  # share of the sharpness that mapped frames have
+_FEATURES = 60  # in the image
+_MATCHES = 15  # with any other frame
+
 
 @dataclass(frozen=True)
 class Matching:
@@ -25,27 +32,14 @@ class Matching:
     flat: np.ndarray
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Below or above which an image is given as the reason."""
-
-    dark: float = 25.0  # mean of the brightest channel, 0..255
-    saturated: float = 0.4  # share of white pixels
-    blur: float = 0.5  # share of the sharpness that mapped frames have
-    features: int = 60
-    matches: int = 15  # with any other frame
-
-
-def reasons(measures: Measures, matching: Matching, mapped: np.ndarray, limits: Limits = Limits()) -> list[str]:
+def reasons(measures: Measures, matching: Matching, mapped: np.ndarray) -> list[str]:
     """The likely reason for each frame (n,) that is not mapped (n,) bool; "" for those that are."""
     sharp = measures.sharpness[mapped] if mapped.any() else measures.sharpness
     sharp = sharp[np.isfinite(sharp)]
     # Without any mapped frame the sharpest have to say what is sharp.
     usual = float(np.median(sharp) if mapped.any() else np.quantile(sharp, 0.9)) if len(sharp) else 0.0
     best, flat = _best_matches(matching, len(mapped))
-    return [
-        "" if mapped[i] else _reason(i, measures, matching, usual, best[i], flat[i], limits) for i in range(len(mapped))
-    ]
+    return ["" if mapped[i] else _reason(i, measures, matching, usual, best[i], flat[i]) for i in range(len(mapped))]
 
 
 def _best_matches(matching: Matching, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -53,27 +47,25 @@ def _best_matches(matching: Matching, count: int) -> tuple[np.ndarray, np.ndarra
     best, good, flat = np.zeros(count, int), np.zeros(count), np.zeros(count)
     for side in (0, 1):
         np.maximum.at(best, matching.pairs[:, side], matching.matches)
-        many = matching.matches >= 15
+        many = matching.matches >= _MATCHES
         np.add.at(good, matching.pairs[many, side], 1)
         np.add.at(flat, matching.pairs[many, side], matching.flat[many])
     return best, flat / np.maximum(good, 1)
 
 
-def _reason(
-    i: int, measures: Measures, matching: Matching, usual: float, best: int, flat: float, limits: Limits
-) -> str:
+def _reason(i: int, measures: Measures, matching: Matching, usual: float, best: int, flat: float) -> str:
     brightness, white, sharpness = measures.brightness[i], measures.saturated[i], measures.sharpness[i]
     if not np.isfinite(brightness):
         return "nothing of it is inside the mask"
-    if brightness < limits.dark:
+    if brightness < _DARK:
         return f"too dark: mean brightness {brightness:.0f} of 255"
-    if white > limits.saturated:
+    if white > _SATURATED:
         return f"saturated: {white:.0%} of its pixels are white"
-    if sharpness < limits.blur * usual:
+    if sharpness < _BLURRED * usual:
         return f"blurred: {sharpness / usual:.0%} of the sharpness of the mapped frames"
-    if matching.features[i] < limits.features:
+    if matching.features[i] < _FEATURES:
         return f"few features: {matching.features[i]}"
-    if best < limits.matches:
+    if best < _MATCHES:
         return f"no matches: {best} at most with any other frame"
     if flat > 0.5:
         return f"no parallax: a turn or a plane explains {flat:.0%} of its matched pairs"

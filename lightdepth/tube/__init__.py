@@ -1,12 +1,13 @@
 """The synthetic colon: shape, texture, light and camera path -> frames and a SLAM export with exact truth."""
 
 from lightdepth.tube.film import FilmConfig
-from lightdepth.tube.path import PathConfig, any_field, camera_path, lens, octagon
+from lightdepth.tube.path import Lens, PathConfig, any_field, camera_path, lens, octagon
 from lightdepth.tube.scene import SensorConfig, ShapeConfig, TextureConfig, Tube, TubeConfig, cavity, realistic
 from lightdepth.tube.sequence import TubeSequence, render_sequence, tube_frames
 
 __all__ = [
     "FilmConfig",
+    "Lens",
     "PathConfig",
     "SensorConfig",
     "ShapeConfig",

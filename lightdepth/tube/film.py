@@ -19,12 +19,19 @@ from lightdepth.tube.shape import smooth_noise
 class FilmConfig:
     """Ranges of what lies on the wall; all of it is off."""
 
-    mucus: tuple[float, float] = (0.0, 0.0)  # share of the wall under a film of mucus
-    mucus_tint: tuple[float, float] = (0.0, 0.4)  # how much of the wall's colour it hides
-    bubbles: tuple[int, int] = (0, 0)  # clusters
+    mucus: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the share of the wall under a film of mucus. A larger one covers more of it; (0, 0) makes
+    none."""
+    mucus_tint: tuple[float, float] = (0.0, 0.4)
+    """Ends of the range of the share of the wall's colour that mucus hides. A larger one makes thicker mucus."""
+    bubbles: tuple[int, int] = (0, 0)
+    """Least and largest number of clusters of bubbles in a colon. More hide more of the wall."""
     bubble_radius: tuple[float, float] = (0.5, 1.8)
-    stool: tuple[int, int] = (0, 0)  # specks
+    """Ends of the range of the radius of a bubble, mm. A larger one makes larger bubbles."""
+    stool: tuple[int, int] = (0, 0)
+    """Least and largest number of specks of stool in a colon. More hide more of the wall."""
     stool_radius: tuple[float, float] = (0.4, 2.5)
+    """Ends of the range of the radius of a speck of stool, mm. A larger one makes larger specks."""
 
 
 @dataclass(frozen=True)

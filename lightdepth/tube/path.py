@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,19 +17,20 @@ from lightdepth.datasets.c3vd import C3VD
 from lightdepth.errors import InputError
 from lightdepth.tube.shape import TubeShape
 
+Lens = Literal["pinhole", "telescope", "fisheye", "c3vd"]
+
 
 @dataclass(frozen=True)
 class PathConfig:
-    """How the endoscope moves; pairs are the ends of a uniform range.
-
-    Args:
-        sway: deviation from the centreline, as a share of the radius; it ends at 0.3 / 0.13 times as much.
-        turned: radians by which each view is turned away from the way ahead, in any direction: beyond 0 the walls are
-            looked at from the front, and neighbouring frames have little to do with each other.
-    """
+    """How the endoscope moves; pairs are the ends of a uniform range."""
 
     sway: float = 0.13
+    """Deviation from the centreline, as a share of the radius; the path leaves the centreline by 0.3 / 0.13 times as
+    much at most. A larger one looks at the wall from nearer."""
     turned: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the angle by which each view is turned away from the way ahead, in any direction, radians.
+    A larger one looks at walls more from the front, and neighbouring frames then have little to do with each
+    other."""
 
 
 def lens(kind: str, width: int, height: int) -> CameraModel:

@@ -38,12 +38,21 @@ from lightdepth.tube.wall import WallMap, place_of
 @dataclass(frozen=True)
 class TubeConfig:
     shape: ShapeConfig = field(default_factory=ShapeConfig)
+    """Ranges of the shape of a colon."""
     texture: TextureConfig = field(default_factory=TextureConfig)
+    """Ranges of what is painted on the wall of a colon."""
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    """Ranges of the light and the camera of an endoscope."""
     film: FilmConfig = field(default_factory=FilmConfig)
+    """Ranges of what lies on the wall of a colon: mucus, bubbles, stool."""
     path: PathConfig = field(default_factory=PathConfig)
-    patch: float = 3.5  # mm along s, of the patches that light each other
-    least_cosine: float = 0.0  # normals interpolated across a fold's edge may look away: no further than this; 0 as is
+    """How the endoscope moves through the colon."""
+    patch: float = 3.5
+    """Length along the tube of the patches of wall that light each other, mm. A larger one makes coarser indirect
+    light, sooner."""
+    least_cosine: float = 0.0
+    """Least cosine to the viewer of a normal interpolated across a fold's edge; 0 leaves normals as they are. A
+    larger one turns such normals more towards the camera."""
 
 
 def realistic() -> TubeConfig:

@@ -26,31 +26,68 @@ class SensorConfig:
     nothing else is said; everything from cosine_exponent on is off."""
 
     gamma: tuple[float, float] = (2.0, 2.6)
+    """Ends of the range of the exponent gamma of the camera's response v^(1/gamma). A larger one brightens dark parts
+    more."""
     mu: tuple[float, float] = (2.2, 3.4)
-    light_offset: float = 2.0  # mm, deviation of the light's position sideways
+    """Ends of the range of the exponent mu of the light's spread exp(-mu (1 - cos psi)), psi the angle from its axis.
+    A larger one makes a narrower light."""
+    light_offset: float = 2.0
+    """Deviation of the light's position sideways, mm. A larger one puts lamps farther from the camera."""
     reflectance: tuple[float, float] = (0.0, 0.7)
+    """Ends of the range of the share of light that the wall throws back on other wall. A larger one makes more
+    indirect light."""
     specular: tuple[float, float] = (0.0, 0.5)
-    bright_share: tuple[float, float] = (0.03, 0.2)  # share of pixels that auto exposure lets saturate
-    shoulder: tuple[float, float] = (0.75, 1.0)  # code value at which the tone curve starts to bend
-    noise: tuple[float, float] = (0.003, 0.012)  # deviation in code values
-    exposure: tuple[float, float] = (0.1, 0.1)  # deviation of log gain from frame to frame
-    cosine_exponent: tuple[float, float] = (
-        1.0,
-        1.0,
-    )  # 1 is Lambert; rough walls have less, satin ones more (Minnaert: 2k - 1)
-    gloss: tuple[float, float] = (60.0, 60.0)  # exponent of the highlights' lobe
-    roughness: tuple[float, float] = (0.1, 0.1)  # slopes that break up the highlights
-    sparkle: tuple[float, float] = (0.0, 0.0)  # slopes of the finest relief, tenths of a millimetre
-    vignetting: tuple[float, float] = (0.0, 0.0)  # exponent k
-    glare: tuple[float, float] = (0.0, 0.0)  # share of the light that the lens spreads over the whole image
-    bloom: tuple[float, float] = (0.0, 0.0)  # share of what is above white that spills over
-    motion: tuple[float, float] = (0.0, 0.0)  # median length of motion blur, share of the image height
-    defocus: tuple[float, float] = (0.0, 0.0)  # sigma, share of the image height
-    cast: tuple[float, float] = (0.0, 0.0)  # deviation of the white balance, log
-    contrast: tuple[float, float] = (0.0, 0.0)  # of the tone curve's S, -1 to 1
-    shot_noise: tuple[float, float] = (0.0, 0.0)  # deviation at linear white; falls with the root of the light
-    sharpen: tuple[float, float] = (0.0, 0.0)  # weight of unsharp masking
-    jpeg: tuple[int, int] = (100, 100)  # quality with halved chroma; 100 is none
+    """Ends of the range of a factor on the strength of highlights. A larger one makes brighter highlights; (0, 0)
+    makes none."""
+    bright_share: tuple[float, float] = (0.03, 0.2)
+    """Ends of the range of the share of pixels that auto exposure lets saturate. A larger one makes brighter
+    images."""
+    shoulder: tuple[float, float] = (0.75, 1.0)
+    """Ends of the range of the code value, in [0, 1], from which the tone curve bends. A higher one bends less; 1 is
+    none."""
+    noise: tuple[float, float] = (0.003, 0.012)
+    """Ends of the range of the deviation of the noise, code values in [0, 1]. A larger one makes noisier images."""
+    exposure: tuple[float, float] = (0.1, 0.1)
+    """Ends of the range of the deviation of the log of the gain from frame to frame. A larger one makes brightness
+    jump more."""
+    cosine_exponent: tuple[float, float] = (1.0, 1.0)
+    """Ends of the range of the exponent of the cosine of reflection: 1 is Lambert; rough walls have less, satin ones
+    more (Minnaert: 2k - 1). A larger one makes slanted wall darker."""
+    gloss: tuple[float, float] = (60.0, 60.0)
+    """Ends of the range of the exponent of the highlights' lobe. A larger one makes smaller, sharper highlights."""
+    roughness: tuple[float, float] = (0.1, 0.1)
+    """Ends of the range of the slope, a ratio, of the bumps that break up highlights. A larger one scatters them
+    more."""
+    sparkle: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the slope, a ratio, of the finest relief, tenths of a millimetre wide. A larger one breaks
+    highlights into more sparks."""
+    vignetting: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the exponent k of the lens's vignetting cos^k psi. A larger one makes darker corners."""
+    glare: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the share of light that the lens spreads over the whole image. A larger one veils dark
+    parts more."""
+    bloom: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the share of what is above white that spills over to its surroundings. A larger one makes
+    wider halos."""
+    motion: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the median length of motion blur, as a share of the image height. A larger one blurs
+    more."""
+    defocus: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the sigma of the focus blur, as a share of the image height. A larger one blurs more."""
+    cast: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the deviation of the log of the white balance. A larger one makes stronger colour
+    casts."""
+    contrast: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the strength of the tone curve's S, a factor from -1 to 1. A larger one makes more
+    contrast."""
+    shot_noise: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the deviation of the noise at linear white, a share of it, which falls with the root of
+    the light. A larger one makes noisier images."""
+    sharpen: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the weight of the processor's unsharp masking. A larger one makes harder edges."""
+    jpeg: tuple[int, int] = (100, 100)
+    """Ends of the range of the JPEG quality, a number up to 100, with halved chroma; 100 is no compression. A higher
+    one leaves fewer artefacts."""
 
 
 @dataclass(frozen=True)

@@ -19,19 +19,39 @@ class ShapeConfig:
     """What a colon may look like; pairs are the ends of a uniform range. Lengths in mm."""
 
     length: float = 150.0
+    """Length of the colon along its centreline, mm. A longer one holds longer paths and takes longer to make."""
     radius: tuple[float, float] = (15.0, 25.0)
-    bend: tuple[float, float] = (0.0, 0.9)  # how far the direction swings along the tube, radians
+    """Ends of the range of the mean radius, mm. A larger one makes a wider colon."""
+    bend: tuple[float, float] = (0.0, 0.9)
+    """Ends of the range of how far the direction swings along the tube, radians. A larger one makes a more winding
+    colon."""
     fold_spacing: tuple[float, float] = (11.0, 24.0)
-    fold_depth: tuple[float, float] = (0.12, 0.38)  # share of the radius
+    """Ends of the range of the distance from one fold to the next, mm. A larger one makes fewer folds."""
+    fold_depth: tuple[float, float] = (0.12, 0.38)
+    """Ends of the range of how far folds reach into the lumen, as a share of the radius. A larger one hides more wall
+    behind them."""
     fold_width: tuple[float, float] = (1.6, 3.2)
-    bump: tuple[float, float] = (0.01, 0.05)  # share of the radius, undulation between the folds
-    step: float = 0.8  # grid spacing
-    crescent: tuple[float, float] = (0.0, 0.0)  # how unlike the three parts of a fold are: 1, and some are missing
-    waviness: tuple[float, float] = (0.0, 0.0)  # mm, deviation of a fold's course from a plane
-    taeniae: tuple[float, float] = (0.0, 0.0)  # share of the radius by which three bands pull the wall inwards
+    """Ends of the range of a fold's half width along the tube, mm. A larger one makes blunter folds."""
+    bump: tuple[float, float] = (0.01, 0.05)
+    """Ends of the range of the wall's undulation between the folds, as a share of the radius. A larger one makes a
+    less even wall."""
+    step: float = 0.8
+    """Distance between the grid's points on the wall, mm. A larger one makes a coarser wall, sooner."""
+    crescent: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range, in [0, 1], of the share by which the three parts of a fold differ; at 1 some are missing. A
+    larger one makes less regular folds."""
+    waviness: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of how far a fold's course deviates from a plane, mm. A larger one makes wavier folds."""
+    taeniae: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of how far three bands pull the wall inwards, as a share of the radius. A larger one makes a
+    more triangular lumen."""
     polyps: tuple[int, int] = (0, 0)
-    polyp_radius: tuple[float, float] = (1.5, 5.0)  # of the head
-    stalked: float = 0.35  # share of polyps on a stalk
+    """Least and largest number of polyps in a colon. More make images without one rarer."""
+    polyp_radius: tuple[float, float] = (1.5, 5.0)
+    """Ends of the range of the radius of a polyp's head, mm. A larger one makes larger polyps, as far as the
+    endoscope can pass."""
+    stalked: float = 0.35
+    """Share of polyps that stand on a stalk. A larger one makes fewer flat ones."""
 
 
 @dataclass(frozen=True)

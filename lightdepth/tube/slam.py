@@ -21,15 +21,25 @@ from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 class SlamConfig:
     """How good the simulated SLAM is."""
 
-    keyframe_every: int = 2  # frames
+    keyframe_every: int = 2
+    """Number of frames from one keyframe to the next. More make fewer keyframes."""
     maps: int = 2
-    shared_keyframes: int = 2  # between neighbouring submaps
-    points_per_keyframe: int = 250  # newly made by each keyframe
-    spurious: float = 0.3  # share of wrong points
-    point_noise: float = 0.01  # relative, at 20 mm; grows in proportion to the distance (error ~ distance²)
-    pixel_noise: float = 0.5  # px
+    """Number of submaps that the keyframes are divided among. More make shorter submaps."""
+    shared_keyframes: int = 2
+    """Number of keyframes that a submap shares with the one before it. More make submaps easier to join."""
+    points_per_keyframe: int = 250
+    """Largest number of points that each keyframe makes anew. More make a denser map."""
+    spurious: float = 0.3
+    """Share of the map points that are wrong. A larger one makes the map harder to densify."""
+    point_noise: float = 0.01
+    """Deviation of a point's distance, as a share of it, at 20 mm; it grows in proportion to the distance (error ~
+    distance²). A larger one makes a noisier map."""
+    pixel_noise: float = 0.5
+    """Deviation of where a point is observed in the image, pixels. A larger one makes noisier observations."""
     pose_noise_mm: float = 0.05
+    """Deviation of a keyframe's place along each axis, mm. A larger one makes noisier poses."""
     pose_noise_deg: float = 0.05
+    """Deviation of a keyframe's rotation about each axis, degrees. A larger one makes noisier poses."""
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,32 @@ from lightdepth.tube.shape import smooth_noise
 class TextureConfig:
     """Ranges of the wall's appearance."""
 
-    hue: tuple[float, float] = (-0.03, 0.06)  # turns of the colour circle; 0 is red
+    hue: tuple[float, float] = (-0.03, 0.06)
+    """Ends of the range of the wall's hue, turns of the colour circle; 0 is red. A larger one is more orange."""
     saturation: tuple[float, float] = (0.3, 0.65)
-    mottling: tuple[float, float] = (0.02, 0.08)  # deviation of saturation
-    value: tuple[float, float] = (0.0, 0.12)  # how much darker the darkest spots are: what LightDepth assumes to be 0
+    """Ends of the range of the wall's saturation, a share in [0, 1]. A larger one makes deeper colours."""
+    mottling: tuple[float, float] = (0.02, 0.08)
+    """Ends of the range of the deviation of saturation over the wall, a share. A larger one makes a more mottled
+    wall."""
+    value: tuple[float, float] = (0.0, 0.12)
+    """Ends of the range of how much darker the darkest spots are, a share, which LightDepth assumes to be 0. A larger
+    one breaks that assumption more."""
     vessels: tuple[int, int] = (10, 45)
-    resolution: float = 0.14  # mm per texel along s
-    vessel_width: tuple[float, float] = (0.25, 0.7)  # mm, of the stems
-    vessel_value: tuple[float, float] = (0.0, 0.0)  # how much darker vessels are than the wall
-    vessel_strength: tuple[float, float] = (1.0, 1.0)  # how well they show
-    blotches: tuple[float, float] = (0.0, 0.0)  # how much more saturated inflamed patches are
-    speckle: tuple[float, float] = (0.0, 0.0)  # deviation of saturation at the scale of mucosal pits, 0.3 mm
+    """Least and largest number of stems of vessels, each of which branches. More give the wall more texture."""
+    resolution: float = 0.14
+    """Size of a texel along the tube, mm. A larger one makes coarser paint, sooner."""
+    vessel_width: tuple[float, float] = (0.25, 0.7)
+    """Ends of the range of the width of a vessel's stem, mm. A larger one makes thicker vessels."""
+    vessel_value: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of how much darker vessels are than the wall, a share. A larger one makes darker vessels."""
+    vessel_strength: tuple[float, float] = (1.0, 1.0)
+    """Ends of the range of a factor on how well vessels show. A larger one makes them plainer."""
+    blotches: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of how much more saturated inflamed patches are, a share. A larger one makes redder patches;
+    (0, 0) makes none."""
+    speckle: tuple[float, float] = (0.0, 0.0)
+    """Ends of the range of the deviation of saturation at the scale of mucosal pits, 0.3 mm, a share. A larger one
+    makes a grainier wall."""
 
 
 def make_texture(length: float, circumference: float, config: TextureConfig, rng: np.random.Generator) -> np.ndarray:

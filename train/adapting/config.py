@@ -14,29 +14,37 @@ class AdaptConfig:
     """What of the network learns, from what, and for how long."""
 
     steps: int = 300
-    """number of training steps; more of them learn more, and forget more of what the checkpoint knew"""
+    """Number of training steps. More adapt further and take longer."""
     learning_rate: float = 5e-4
-    """the highest learning rate of its one cycle; a higher one learns faster, and goes astray sooner"""
+    """Rate of learning at the top of its one cycle, a number above 0. A higher one learns faster, and less
+    steadily."""
     batch_size: int = 4
-    """number of frames in a step"""
+    """Number of frames in a step. More make steadier steps and take more time and memory."""
     size: tuple[int, int] | None = None
-    """width and height that it learns at, pixels; left out, the rows of the checkpoint"""
+    """Width and height that the network learns at, pixels; left out, the rows of the checkpoint. A larger one shows
+    finer detail and takes longer."""
     what: What = "all"
-    """part of the network that learns: all, decoder, norms (scale and shift of the normalisations) or low_rank"""
+    """Which part of the network learns: all, decoder, norms (scale and shift of the normalisations) or low_rank."""
     rank: int = 4
-    """rank of what low_rank adds to every convolution; a higher one can learn more"""
+    """Number of ranks of what low_rank adds to every convolution. More let it change further."""
     anchor: float = 0.0
-    """weight that holds the shape of each distance map to what the checkpoint said before; 0 lets it go"""
+    """Weight that holds the shape of each distance map to what the checkpoint said before. A larger one holds it more
+    firmly."""
     replay: int = 0
-    """number of synthetic colons of the kind that the checkpoint learned from, which fill half of each batch"""
+    """Number of synthetic colons of the kind that the checkpoint learned from, which fill half of each batch; 0 for
+    none. More show more variety and take longer to render."""
     points: float = 0.0
-    """weight of the map's points as teachers; those that a held-out frame saw only judge"""
+    """Weight of the map's points as teachers; those that a held-out frame saw only judge. A larger one follows the
+    points more closely."""
     overlap: float = 0.0
-    """weight of where two keyframes of the map see the same tissue; 0 leaves it out"""
+    """Weight of the places where two keyframes of the map see the same tissue. A larger one makes their depths agree
+    better."""
     held_out: float = 0.2
-    """share of each sequence, at its end, that judges and is never trained on"""
+    """Share of each sequence, at its end, that judges and is never trained on. A larger one judges more surely and
+    trains on less."""
     seed: int = 0
-    """number that draws order, augmentation, replayed colons and low-rank additions"""
+    """Number that draws order, augmentation, replayed colons and low-rank additions. Another one makes another
+    run."""
 
     def __post_init__(self) -> None:
         if min(self.steps, self.batch_size) < 1 or not self.learning_rate > 0 or self.replay < 0:

@@ -30,30 +30,30 @@ NOT_IN_MAP, FEW_KEYFRAMES = "not in the map", "too few covisible keyframes"
 
 @dataclass(frozen=True)
 class NodeRules:
-    """When a frame belongs to a node, and which nodes are kept.
-
-    Args:
-        similarity: cosine to a view of the node above which a frame is alike, and not matched
-        min_matches: more matches than this make two frames covisible
-        min_spread: and they lie in at least this share of the image's cells
-        min_views: of a node that is kept
-        max_skipped: alike frames in a row; the next is matched all the same
-        min_frames: from one view of a node to the next; a covisible frame that comes sooner is a frame of the node only
-        max_views: a node with more than these is closed
-        reference: the view that frames are matched with, the node's last or middle one
-        blur: frames with fewer features than this share of the kept ones' median are blur, and rejected whatever they
-            match: moved or out of focus alike, they match each other
-    """
+    """When a frame belongs to a node, and which nodes are kept."""
 
     similarity: float = 0.98
+    """Cosine to a view of the node above which a frame counts as alike, and is not matched. A higher one matches more
+    frames and takes longer."""
     min_matches: int = 15
+    """Number of matches above which two frames are covisible. More keep fewer frames."""
     min_spread: float = 0.2
+    """Least share of the image's cells that the matches must lie in. A larger one keeps fewer frames."""
     min_views: int = 3
+    """Least number of views of a node that is kept. More keep fewer frames."""
     max_skipped: int = 1
+    """Largest number of alike frames in a row that are not matched; the next is matched all the same. More take less
+    time and notice changes later."""
     min_frames: int = 1
+    """Least number of frames from one view of a node to the next; a covisible frame that comes sooner belongs to the
+    node, but is no view. More thin the views out."""
     max_views: int = 29
+    """Number of views above which a node is closed. More make longer nodes."""
     reference: Literal["last", "middle"] = "last"
+    """Which view of a node frames are matched with: its last or its middle one."""
     blur: float = 0.5
+    """Share of the kept frames' median number of features below which a frame is blur, and rejected whatever it
+    matches: moved or out of focus alike, such frames match each other. A larger one rejects more frames."""
 
     def __post_init__(self) -> None:
         if min(self.min_views, self.min_frames, self.max_views) < 1 or min(self.min_matches, self.max_skipped) < 0:
@@ -206,20 +206,18 @@ def _verdict(seen: _Seen, blurred: bool, views_in: Counter[int], good: set[int])
 
 @dataclass(frozen=True)
 class MapRules:
-    """Which frames a sparse map vouches for.
-
-    Args:
-        points: two keyframes with at least this many points in common are covisible
-        keyframes: a keyframe is kept with at least this many covisible others
-        between: frames between two kept, covisible keyframes that follow each other are kept where these are at most
-            this many frames apart; 1 keeps keyframes only
-        published: take the pairs of camerasModel.txt (EndoMapper), where it is beside the model, instead of `points`
-    """
+    """Which frames a sparse map vouches for."""
 
     points: int = 15
+    """Number of points in common from which two keyframes are covisible. More keep fewer frames."""
     keyframes: int = 2
+    """Least number of covisible others that a keyframe must have to be kept. More keep fewer frames."""
     between: int = 40
+    """Number of frames up to which two kept, covisible keyframes that follow each other may be apart for the frames
+    between them to be kept; 1 keeps keyframes only. More keep more frames."""
     published: bool = True
+    """Whether the pairs of camerasModel.txt (EndoMapper) are taken, where it is beside the model, instead of
+    `points`."""
 
     def __post_init__(self) -> None:
         if min(self.points, self.keyframes, self.between) < 1:

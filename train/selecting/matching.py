@@ -46,27 +46,30 @@ class Matcher(Protocol):
 
 @dataclass(frozen=True)
 class SiftSettings:
-    """Features and their geometry.
-
-    Args:
-        width: images are matched at this width, pixels; smaller ones at their own
-        features: most features in a frame
-        contrast: weakest feature, SIFT's contrast threshold
-        largest: largest feature, share of the width; larger ones survive blur and tell nothing of sharpness
-        ratio: distance to the best match over that to the second best, at most
-        angle: from a match's epipolar plane, at most, degrees
-        highlight: pixels with all channels above this are highlights and hold no features
-        border: strip along the mask and around highlights that holds no features, share of the width
-    """
+    """Features and their geometry."""
 
     width: int = 480
+    """Width at which images are matched, pixels; smaller ones are matched at their own. A larger one finds finer
+    features and takes longer."""
     features: int = 800
+    """Largest number of features in a frame. More find more matches and take longer."""
     contrast: float = 0.02
+    """Contrast of the weakest feature, in [0, 1]: SIFT's contrast threshold. A higher one finds fewer features."""
     largest: float = 0.02
+    """Size of the largest feature, as a share of the width; larger ones survive blur and tell nothing of sharpness. A
+    larger one takes in more features."""
     ratio: float = 0.8
+    """Largest ratio of the distance to the best match to that to the second best. A larger one takes in more matches,
+    wrong ones among them."""
     angle: float = 0.5
+    """Largest angle of a match to its epipolar plane, degrees. A larger one takes in more matches, wrong ones among
+    them."""
     highlight: float = 0.95
+    """Brightness, in [0, 1], above which all channels of a highlight are, which holds no features. A higher one takes
+    fewer pixels for highlights."""
     border: float = 0.01
+    """Width of the strip along the mask and around highlights that holds no features, as a share of the image's
+    width. A larger one leaves out more of the image."""
 
 
 @dataclass(frozen=True)
@@ -166,20 +169,18 @@ class OrientationDescriptor:
 
 @dataclass(frozen=True)
 class LoftrSettings:
-    """LoFTR as ColonMapper runs it: grey, half size, masked.
-
-    Args:
-        weights: file with LoFTR's weights (.ckpt, .pth or .safetensors), e.g. kornia's loftr_outdoor.ckpt; nothing is
-            downloaded
-        width: images are matched at this width, pixels; smaller ones at their own
-        confidence: of a match, at least
-        device: to run on, e.g. cpu or cuda
-    """
+    """LoFTR as ColonMapper runs it: grey, half size, masked."""
 
     weights: Path | None = None
+    """File with LoFTR's weights (.ckpt, .pth or .safetensors), e.g. kornia's loftr_outdoor.ckpt; nothing is
+    downloaded."""
     width: int = 720
+    """Width at which images are matched, pixels; smaller ones are matched at their own. A larger one finds finer
+    matches and takes longer."""
     confidence: float = 0.4
+    """Least confidence of a match, a share in [0, 1]. A higher one takes in fewer matches."""
     device: str = "cpu"
+    """Where the matcher runs, by PyTorch's name, e.g. cpu or cuda."""
 
 
 @dataclass(frozen=True)
