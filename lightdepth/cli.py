@@ -15,6 +15,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from lightdepth import __version__
+from lightdepth.errors import InputError, PartialFailure
+from lightdepth.own_packages import own_packages_first
+
 GROUP = "lightdepth.commands"
 ORDER = (
     "demo",
@@ -42,12 +46,17 @@ FILES = ("calibrate-light", "convert-camera", "select", "measure", "bench compar
 def main(argv: list[str] | None = None) -> int:
     """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed."""
     argv = sys.argv[1:] if argv is None else argv
+    try:
+        own_packages_first()
+    except InputError as error:
+        print(f"lightdepth: {error}", file=sys.stderr)
+        return 3
     commands = {entry.name: entry for entry in metadata.entry_points(group=GROUP)}
     if not argv or argv[0] in ("-h", "--help"):
         print(_help(commands))
         return 0 if argv else 2
     if argv[0] in ("-V", "--version"):
-        print(f"lightdepth {metadata.version('lightdepth')}")
+        print(f"lightdepth {__version__}")
         return 0
     verb, rest = argv[0], argv[1:]
     if verb not in commands:
@@ -57,8 +66,6 @@ def main(argv: list[str] | None = None) -> int:
         hint = f"; did you mean {close[0]}?" if close else f"; expected one of {', '.join(_sorted(commands))}"
         print(f"lightdepth: no verb {verb!r}{hint}", file=sys.stderr)
         return 2
-    from lightdepth.errors import InputError, PartialFailure
-
     try:
         function = commands[verb].load()
         if list(inspect.signature(function).parameters) == ["argv"]:
@@ -79,7 +86,9 @@ def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
     import jsonargparse
 
+    from lightdepth.gone_settings import without_gone
     from lightdepth.options import add_groups, flags_of, groups_of, with_groups
+    from lightdepth.presets import preset_help, presets, with_preset
 
     jsonargparse.set_parsing_settings(docstring_parse_attribute_docstrings=True)
 
@@ -87,6 +96,9 @@ def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     summary = (inspect.getdoc(function) or "").split("\n")[0]
     parser = jsonargparse.ArgumentParser(prog=f"lightdepth {verb}", description=summary, default_env=False)
     parser.add_argument("--config", action="config", help="a YAML file with any of these options")
+    if presets(verb):
+        parser.add_argument("--preset", metavar="NAME", help=preset_help(verb))
+    argv = without_gone(verb, with_preset(verb, argv, parser.error))
     parameters = inspect.signature(function).parameters
     # Declared here, because options derived from parameters have no short form and no bare flags.
     if "output" in parameters:

@@ -24,17 +24,20 @@ TRAINER_DEFAULTS = {
 def train(argv: list[str] | None = None) -> int:
     """Train a depth network on frames alone, from the decline of the light.
 
-    `lightdepth train --config C -o RUN [--resume | --overwrite] [overrides]`: every option of the data, the model and
-    Lightning's Trainer is a dotted override. `--resume` without --config takes the run's own config.yaml.
+    `lightdepth train --preset NAME -o RUN [--resume | --overwrite] [overrides]`: every option of data, model and
+    Lightning's Trainer is a dotted override. `--resume` without --preset and --config takes the run's config.yaml.
     """
     import lightning.pytorch as pl
+
+    from lightdepth.gone_settings import without_gone
+    from lightdepth.presets import with_preset
 
     from .datamodule import FrameDataModule
     from .fit import check_output, fit
 
     given = list(sys.argv[1:] if argv is None else argv)
     parser = training_parser()
-    config = parser.parse_args(_with_own_config(given))
+    config = parser.parse_args(without_gone("train", _with_own_config(with_preset("train", given, parser.error))))
 
     output = Path(config.output)
     check_output(output, config.resume, config.overwrite)  # before the seconds that the rest takes
@@ -52,6 +55,7 @@ def training_parser() -> ArgumentParser:
     from jsonargparse import ArgumentParser
 
     from lightdepth.module import LightDepth
+    from lightdepth.presets import preset_help
 
     from .datamodule import FrameData
     from .fit import FitConfig
@@ -62,6 +66,7 @@ def training_parser() -> ArgumentParser:
     parser.add_argument(
         "--config", action="config", help="YAML with any of the options below, e.g. configs/train/*.yaml"
     )
+    parser.add_argument("--preset", metavar="NAME", help=preset_help("train"))
     parser.add_argument("-o", "--output", required=True, help="folder of the run")
     parser.add_argument("--resume", action="store_true", help="go on from OUTPUT/checkpoints/last.ckpt")
     parser.add_argument("--overwrite", action="store_true", help="replace a run that is already there")
@@ -79,13 +84,13 @@ def training_parser() -> ArgumentParser:
 def as_yaml(parser: ArgumentParser, config: Namespace) -> str:
     """The settings of a run, without where it goes and what becomes of what is there."""
     kept = config.clone()
-    for key in ("config", "output", "resume", "overwrite"):
+    for key in ("config", "preset", "output", "resume", "overwrite"):
         kept.pop(key, None)
     return parser.dump(kept, skip_validation=True)
 
 
 def _with_own_config(argv: list[str]) -> list[str]:
-    """`--resume` without --config takes the config.yaml of the run."""
+    """`--resume` without --preset and --config takes the config.yaml of the run."""
     if "--resume" not in argv or any(a == "--config" or a.startswith("--config=") for a in argv):
         return argv
     for flag, value in pairwise([*argv, ""]):
