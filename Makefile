@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= runs/demo
 export OMP_WAIT_POLICY = passive
 
-.PHONY: setup demo test test-slow lint format bench ablation clean
+.PHONY: setup demo test test-slow lint format bench same ablation clean
 
 setup: $(VENV)/.ready
 
@@ -36,6 +36,10 @@ format: setup
 
 bench: setup
 	$(BIN)/python -m pytest tests/benchmarks -o python_files='bench_*.py' -o addopts= -s
+
+# Whether the working tree makes the same, byte for byte, as another revision: make same BASE=<revision>
+same: setup
+	$(BIN)/python tests/same_results.py $(BASE)
 
 # About an hour and a quarter on one core; what is already there is kept.
 ablation: setup

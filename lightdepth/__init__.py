@@ -6,6 +6,7 @@ The public names are those of `__all__`; docs/api.md shows each at work.
 from typing import TYPE_CHECKING
 
 from lightdepth.lazy import public
+from lightdepth.moved import install as install_moved
 
 if TYPE_CHECKING:
     from lightdepth.camera import CameraModel as CameraModel
@@ -41,3 +42,4 @@ _HOMES = {
 }
 __all__ = list(_HOMES)
 __getattr__, __dir__ = public(__name__, _HOMES)
+install_moved()

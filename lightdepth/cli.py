@@ -19,6 +19,10 @@ from lightdepth.pages import PAGES, Page
 if TYPE_CHECKING:
     from lightdepth.parsing import Parser
 
+from lightdepth import __version__
+from lightdepth.errors import InputError, PartialFailure
+from lightdepth.own_packages import own_packages_first
+
 GROUP = "lightdepth.commands"
 ORDER = (
     "demo",
@@ -44,12 +48,17 @@ ORDER = (
 def main(argv: list[str] | None = None) -> int:
     """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed."""
     argv = sys.argv[1:] if argv is None else argv
+    try:
+        own_packages_first()
+    except InputError as error:
+        print(f"lightdepth: {error}", file=sys.stderr)
+        return 3
     commands = {entry.name: entry for entry in metadata.entry_points(group=GROUP)}
     if not argv or argv[0] in ("-h", "--help"):
         print(_help(commands))
         return 0 if argv else 2
     if argv[0] in ("-V", "--version"):
-        print(f"lightdepth {metadata.version('lightdepth')}")
+        print(f"lightdepth {__version__}")
         return 0
     verb, rest = argv[0], argv[1:]
     if verb not in commands:
@@ -59,8 +68,6 @@ def main(argv: list[str] | None = None) -> int:
         hint = f"; did you mean {close[0]}?" if close else f"; expected one of {', '.join(_sorted(commands))}"
         print(f"lightdepth: no verb {verb!r}{hint}", file=sys.stderr)
         return 2
-    from lightdepth.errors import InputError, PartialFailure
-
     try:
         function = commands[verb].load()
         if list(inspect.signature(function).parameters) == ["argv"]:
@@ -79,10 +86,13 @@ def main(argv: list[str] | None = None) -> int:
 
 def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
+    from lightdepth.gone_settings import without_gone
     from lightdepth.options import with_groups
     from lightdepth.parsing import parsed
+    from lightdepth.presets import with_preset
 
     parser = verb_parser(function, verb)
+    argv = without_gone(verb, with_preset(verb, argv, parser.error))
     return with_groups(function, parser.instantiate(parsed(parser, argv)))
 
 
@@ -92,12 +102,15 @@ def verb_parser(function: Any, verb: str) -> Parser:
 
     from lightdepth.options import add_groups, groups_of
     from lightdepth.parsing import Parser, finish
+    from lightdepth.presets import preset_help, presets
 
     said = {p.arg_name: p.description for p in parse_docstring(inspect.getdoc(function) or "").params}
     # The first line only: jsonargparse shows the rest of the docstring beside the options.
     summary = (inspect.getdoc(function) or "").split("\n")[0]
     parser = Parser(prog=f"lightdepth {verb}", description=summary, default_env=False)
     parser.add_argument("--config", action="config")
+    if presets(verb):
+        parser.add_argument("--preset", metavar="NAME", help=preset_help(verb))
     parameters = inspect.signature(function).parameters
     # Declared here, because options derived from parameters have no short form and no bare flags.
     if "output" in parameters:

@@ -30,19 +30,22 @@ TRAINER_DEFAULTS = {
 def train(argv: list[str] | None = None) -> int:
     """Train a depth network on frames alone, from the decline of the light.
 
-    `lightdepth train --config C -o RUN [--resume | --overwrite] [overrides]`: every option of the data, the model and
-    Lightning's Trainer is a dotted override. `--resume` without --config takes the run's own config.yaml.
+    `lightdepth train --preset NAME -o RUN [--resume | --overwrite] [overrides]`: every option of data, model and
+    Lightning's Trainer is a dotted override. `--resume` without --preset and --config takes the run's config.yaml.
     """
     import lightning.pytorch as pl
 
+    from lightdepth.gone_settings import without_gone
     from lightdepth.parsing import parsed
+    from lightdepth.presets import with_preset
 
     from .datamodule import FrameDataModule
     from .fit import check_output, fit
 
     given = list(sys.argv[1:] if argv is None else argv)
     parser = training_parser()
-    config = parsed(parser, _with_own_config(given))
+    argv = without_gone("train", _with_own_config(with_preset("train", given, parser.error)))
+    config = parsed(parser, argv)
 
     output = Path(config.output)
     check_output(output, config.resume, config.overwrite)  # before the seconds that the rest takes
@@ -60,6 +63,7 @@ def training_parser() -> Parser:
 
     from lightdepth.module import LightDepth
     from lightdepth.parsing import Parser, finish
+    from lightdepth.presets import preset_help
 
     from .datamodule import FrameData
     from .fit import FitConfig
@@ -67,6 +71,7 @@ def training_parser() -> Parser:
     summary = "Train a depth network on frames alone, from the decline of the light."
     parser = Parser(prog="lightdepth train", description=summary, allow_abbrev=False)
     parser.add_argument("--config", action="config")
+    parser.add_argument("--preset", metavar="NAME", help=preset_help("train"))
     parser.add_argument("-o", "--output", required=True, help="Folder of the run, with its checkpoints and its model.")
     parser.add_argument("--resume", action="store_true", help="Go on from the run's own checkpoints/last.ckpt.")
     parser.add_argument("--overwrite", action="store_true", help="Replace a run that is already there.")
@@ -90,13 +95,13 @@ def training_parser() -> Parser:
 def as_yaml(parser: ArgumentParser, config: Namespace) -> str:
     """The settings of a run, without where it goes and what becomes of what is there."""
     kept = config.clone()
-    for key in ("config", "output", "resume", "overwrite"):
+    for key in ("config", "preset", "output", "resume", "overwrite"):
         kept.pop(key, None)
     return parser.dump(kept, skip_validation=True)
 
 
 def _with_own_config(argv: list[str]) -> list[str]:
-    """`--resume` without --config takes the config.yaml of the run."""
+    """`--resume` without --preset and --config takes the config.yaml of the run."""
     if "--resume" not in argv or any(a == "--config" or a.startswith("--config=") for a in argv):
         return argv
     for flag, value in pairwise([*argv, ""]):

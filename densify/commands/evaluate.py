@@ -35,6 +35,7 @@ from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.models import DepthModel
 from lightdepth.options import Group
+from lightdepth.presets import shipped
 from lightdepth.reporting.run import plain, recorded, run_folder
 from lightdepth.sfm.reconstruction import SfmConfig
 from lightdepth.sparse_map import SparseMap
@@ -131,7 +132,7 @@ def evaluate(
     missing: dict[str, str] = {}
     pairs = {truth.name: (run, truth)} if truth is not None else {}
     if suite is not None and truth is not None:
-        columns = read_suite(suite)
+        columns = read_suite(shipped(suite))
         pairs, missing = present(columns, run, truth)
     model = None if checkpoint is None else load_model(checkpoint, details=False)
     found: dict[str, Evaluation] = {}

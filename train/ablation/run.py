@@ -41,6 +41,7 @@ from lightdepth.metrics import DepthErrors
 from lightdepth.models import NetworkModel
 from lightdepth.module import MIN_RAY_Z
 from lightdepth.network import DepthNetwork
+from lightdepth.presets import shipped
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import plain, recorded, write_run_json
 from lightdepth.tube.variant import REFLECTANCE, variant_frames
@@ -225,9 +226,9 @@ def _plans(
     plans, defaults = [], parser.get_defaults()
     for row in rows:
         where = f"row {row.name!r}"
-        values = _read(base)
+        values = _read(shipped(base))
         if row.preset is not None:
-            values["model"] = _read(row.preset).get("model", {})
+            values["model"] = _read(shipped(row.preset)).get("model", {})
         for dotted, value in {**common, **(row.settings or {})}.items():
             if isinstance(defaults.get(dotted), Namespace) and not isinstance(value, dict):
                 raise InputError(f"{where}: {dotted} is a group of options; give one of them, as {dotted}.NAME")

@@ -1,0 +1,51 @@
+"""Settings of earlier versions that are no more: a config file that has them is still read, with one warning.
+
+A key that was never a setting stays an error: it is a typing mistake.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+GONE_SETTINGS: dict[str, dict[str, str]] = {}
+"""By verb, the dotted keys that are gone, each with what became of it. A key stands for all that is below it."""
+
+
+def without_gone(verb: str, argv: Sequence[str]) -> list[str]:
+    """The words of a command line; a --config FILE that has settings which are gone is put in as text without them."""
+    gone = GONE_SETTINGS.get(verb, {})
+    words = list(argv)
+    for place, word in enumerate(words):
+        joined = word.startswith("--config=")
+        if gone and (joined or (place > 0 and words[place - 1] == "--config")):
+            words[place] = ("--config=" if joined else "") + _kept(word.removeprefix("--config="), gone)
+    return words
+
+
+def _kept(file: str, gone: Mapping[str, str]) -> str:
+    """The file's name, or, where it has settings that are gone, its text without them."""
+    import yaml
+
+    try:
+        settings = yaml.safe_load(Path(file).read_text())
+    except (OSError, ValueError, yaml.YAMLError):
+        return file  # the parser says what is wrong with it
+    found = {key: why for key, why in gone.items() if _dropped(settings, key.split("."))}
+    if not found:
+        return file
+    listed = "; ".join(f"{key} ({why})" for key, why in found.items())
+    warnings.warn(f"{file}: settings that are no more are left out: {listed}", UserWarning, stacklevel=2)
+    return yaml.safe_dump(settings, sort_keys=False)
+
+
+def _dropped(settings: Any, keys: Sequence[str]) -> bool:
+    """Takes a key out of nested settings; False where it is not there."""
+    for key in keys[:-1]:
+        settings = settings.get(key) if isinstance(settings, dict) else None
+    if not isinstance(settings, dict) or keys[-1] not in settings:
+        return False
+    del settings[keys[-1]]
+    return True
