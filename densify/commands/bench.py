@@ -55,14 +55,16 @@ def run(
     """Synthetic colons made from seeds, judged row by row (bench compare A B, bench estimators: --help of each).
 
     Args:
-        output: folder to make, with bench.json and bench.md
-        size: small, two short sequences, minutes; full, eight and a screening, up to an hour
-        first_seed: of the first scene; the others count on from it. Seeds below 1000 were never trained on
-        wrong_shares: of map points, each a SLAM export of its own; left out, those of the size
-        checkpoints: paths, names of bundled ones, or decline (the closed form) or constant
-        recipes: full, paper, or both
-        image_size: width and height of the keyframes, pixels; left out, that of the size
-        overwrite: replace a run made before
+        output: Folder to make, with bench.json and bench.md.
+        size: How much is measured: small, two short sequences, minutes; full, eight and a screening, up to an hour.
+        first_seed: Number that seeds the first scene; the others count on from it. Seeds below 1000 were never
+            trained on. Another one draws other colons.
+        wrong_shares: Shares of wrong map points, each a SLAM export of its own; left out, those of the size. More
+            shares take longer.
+        checkpoints: Depth models to compare: paths, names of bundled ones, decline (the closed form) or constant.
+        recipes: Ways to make surfaces that are compared: full, paper, or both.
+        image_size: Width and height of the keyframes, pixels; left out, that of the size. A larger one takes longer.
+        overwrite: Replace a run made before.
     """
     arguments = recorded(
         method,
@@ -106,10 +108,10 @@ def compare_runs(a: Path, b: Path, output: Path | None = None, seed: int = 0) ->
     """Whether run B is better or worse than run A, or within noise; paired where the scenes are the same.
 
     Args:
-        a: bench.json of the first run, or its folder
-        b: the same of the second
-        output: JSON file to write besides
-        seed: draws the bootstrap
+        a: File bench.json of the first run, or its folder.
+        b: File bench.json of the second run, or its folder.
+        output: JSON file to write the comparison to, besides showing it.
+        seed: Number that draws the bootstrap samples. Another one gives slightly different intervals.
     """
     found = compare(read_bench(a), read_bench(b), seed)
     print(found.markdown(str(a), str(b)))
@@ -129,12 +131,12 @@ def compare_estimators(
     """Estimators of a keyframe's scale side by side, by share, kind and number of wrong points.
 
     Args:
-        output: folder to make, with estimators.json, .md and .png
-        shares: of wrong points
-        points: per keyframe
-        draws: keyframes for each combination
-        seed: draws them
-        overwrite: replace what an earlier run made there
+        output: Folder to make, with estimators.json, .md and .png.
+        shares: Shares of wrong points, each judged on its own. More shares take longer.
+        points: Numbers of points per keyframe, each judged on its own. More numbers take longer.
+        draws: Number of keyframes drawn for each combination. More make the figures more certain and take longer.
+        seed: Number that draws the keyframes and their points. Another one draws others.
+        overwrite: Replace what an earlier run made there.
     """
     arguments = recorded(output=output, shares=shares, points=points, draws=draws, seed=seed)
     config = EstimatorsConfig(shares=shares, points=points, draws=draws, seed=seed)

@@ -34,15 +34,17 @@ def demo(
     """The whole way on a synthetic colon: render, sparse map, densify, evaluate; ends at report.html.
 
     Args:
-        output: run folder to make
-        checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
-        frames: number of frames to render
-        seed: draws the colon; no bundled checkpoint was trained on seeds below 1000
-        size: width and height of the images, pixels
-        lens: pinhole, fisheye or c3vd
-        spurious: share of wrong map points
-        withhold: share of each keyframe's observed points kept out of the alignment
-        overwrite: replace a run made before
+        output: Run folder to make, with the data, the surfaces and the report.
+        checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
+        frames: Number of frames to render. More make a longer sequence and take longer.
+        seed: Number that draws the colon; no bundled checkpoint was trained on seeds below 1000. Another one draws
+            another colon.
+        size: Width and height of the images, pixels. A larger one shows finer detail and takes longer.
+        lens: Lens of the endoscope: pinhole, telescope, fisheye or c3vd.
+        spurious: Share of the map points that are wrong. A larger one makes the map harder to densify.
+        withhold: Share of each keyframe's observed points kept out of the alignment, to judge the surface by. A
+            larger one judges more surely, and aligns on fewer points.
+        overwrite: Replace a run made before.
     """
     arguments = recorded(
         output=output,

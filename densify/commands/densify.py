@@ -34,16 +34,18 @@ def densify(
     """Dense surfaces from frames and a sparse map, one per submap, and one more for submaps that meet.
 
     Args:
-        output: run folder to make
-        map: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the frames
-        checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
+        output: Run folder to make, with the surfaces and the report.
+        map: Sparse map of the frames: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the
+            frames.
+        checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
         sfm: how frames are mapped when there is no map
-        formats: of the mesh: ply, glb, obj
-        mm_per_unit: millimetres per map unit, where known; lengths are then written in mm
-        fit_light: where nobody gave the light, fit it on the map and use it if withheld keyframes agree
-        merge: join submaps that see the same tissue, and give each group one surface besides the single ones
+        formats: Formats of the mesh files to write: ply, and glb and obj besides if wanted.
+        mm_per_unit: Millimetres per map unit, where known; lengths are then written in mm. A larger one makes a
+            larger surface.
+        fit_light: Where nobody gave the light, fit it on the map and use it if withheld keyframes agree.
+        merge: Join submaps that see the same tissue, and give each group one surface besides the single ones.
         merging: when two submaps are one
-        overwrite: replace a run made before
+        overwrite: Replace a run made before.
     """
     unknown = set(formats) - {"ply", "glb", "obj"}
     if unknown or "ply" not in formats:

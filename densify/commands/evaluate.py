@@ -98,13 +98,16 @@ def evaluate(
     """Errors of predictions, a densify run, a map or a trajectory, against truth and between submaps.
 
     Args:
-        run: folder made by densify or predict, one of its map folders (joined_000), a sparse map, or a trajectory (TUM)
-        output: folder for the metrics; evaluation/ in the run when left out
-        join: JSON with the Sim(3) between two submaps (first, second, scale, rotation, translation): their gap
-        suite: YAML naming the sequences below run and truth that stand in one table (configs/bench/c3vd.yaml)
-        checkpoint: sparse maps are made dense with it first, and the surfaces written: a path, a bundled name, decline
-        trajectory: every localised frame of the maps, in place of their keyframes
-        overwrite: replace metrics made before (evaluation/ in a run is replaced without asking)
+        run: Folder made by densify or predict, one of its map folders (joined_000), a sparse map, or a trajectory
+            (TUM).
+        output: Folder for the metrics; left out, evaluation/ in the run.
+        join: JSON file with the Sim(3) between two submaps (first, second, scale, rotation, translation), to judge
+            their gap.
+        suite: YAML file naming the sequences below run and truth that stand in one table (configs/bench/c3vd.yaml).
+        checkpoint: Depth model that sparse maps are made dense with first: a path, a bundled name, or decline; the
+            surfaces are written.
+        trajectory: File with every localised frame of the maps, in place of their keyframes.
+        overwrite: Replace metrics made before (evaluation/ in a run is replaced without asking).
     """
     truth = source.truth
     arguments = recorded(

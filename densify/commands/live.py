@@ -33,15 +33,19 @@ def live(
     """Plays a sequence against the clock: surfaces that grow keyframe by keyframe, and where their time goes.
 
     Args:
-        output: run folder to make
-        map: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the frames, before the clock starts
-        checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
-        rate: keyframes per second that come whether or not the last is done; left out, each comes when the last is done
-        budget_ms: milliseconds that a keyframe may take, from its image to the renewed surface
+        output: Run folder to make, with the surfaces and the timings.
+        map: Sparse map of the frames: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the
+            frames, before the clock starts.
+        checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
+        rate: Number of keyframes per second that come whether or not the last is done; left out, each comes when the
+            last is done. More leave less time for each.
+        budget_ms: Time that a keyframe may take, from its image to the renewed surface, milliseconds. A larger one
+            counts more keyframes as in time.
         sfm: how frames are mapped when there is no map
-        mm_per_unit: millimetres per map unit, where known; lengths are then written in mm
-        fit_light: where nobody gave the light, fit it on the map before the clock starts
-        overwrite: replace a run made before
+        mm_per_unit: Millimetres per map unit, where known; lengths are then written in mm. A larger one makes a
+            larger surface.
+        fit_light: Where nobody gave the light, fit it on the map before the clock starts.
+        overwrite: Replace a run made before.
     """
     check_unit(mm_per_unit)
     if not budget_ms > 0:

@@ -27,14 +27,17 @@ def measure(
     """Lengths and areas on a surface of a densify run: between two places, around one, inside an outline of more.
 
     Args:
-        run: folder made by densify
-        points: places on the surface, [[x, y, z], ...], in its unit
-        frame: number of the keyframe that pixels are given in
-        pixels: places as pixels of that keyframe, [[u, v], ...], first centre at (0.5, 0.5), instead of points
-        radius: with one place, of the disc of wall around it
-        map: number of the map; needed where the run has several
-        mm_per_unit: millimetres per unit of the surface, where the run did not know it
-        output: JSON file to write besides
+        run: Run folder made by densify, or one of its map folders.
+        points: Places on the surface, [[x, y, z], ...], in its unit (mm or map units). More than two outline an area.
+        frame: Number of the keyframe that pixels are given in. Another one has other pixels.
+        pixels: Places as pixels of that keyframe, [[u, v], ...], first centre at (0.5, 0.5), instead of points. More
+            than two outline an area.
+        radius: Radius of the disc of wall around a single place, in the surface's unit (mm or map units). A larger
+            one measures more wall.
+        map: Number of the map; needed where the run has several. Another one is another surface.
+        mm_per_unit: Millimetres per unit of the surface, where the run did not know it. A larger one makes longer
+            lengths.
+        output: JSON file to write the lengths and areas to, besides showing them.
     """
     dense = chosen_map(read_run(run), map, run)
     unit = run_unit(run, mm_per_unit)

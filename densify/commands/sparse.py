@@ -27,15 +27,16 @@ def sparse(
     """A sparse map by pycolmap, where there is no SLAM output.
 
     Args:
-        data: folder of frames
-        output: folder to make, with one COLMAP model per submap
-        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
-        camera: calibration file that wins over the folder's
-        mask: image, white where tissue shows
-        poses: where poses are known and points are only triangulated: truth, those of the sequence, or a TUM file
-            (world from camera) whose times are frame numbers
+        data: Folder of frames, or video, to map.
+        output: Folder to make, with one COLMAP model for each submap.
+        format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
+            looking if left out.
+        camera: Calibration file that wins over the folder's own.
+        mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
+        poses: Known poses, at which points are only triangulated: truth, those of the sequence, or a TUM file (world
+            from camera) whose times are frame numbers.
         sfm: how frames are mapped
-        overwrite: replace a folder made before
+        overwrite: Replace a folder made before.
     """
     source = SequenceSource(data, format, camera, mask=mask)
     arguments = recorded(output=output, data=data, format=format, camera=camera, mask=mask, poses=poses, sfm=sfm)

@@ -29,14 +29,16 @@ def calibrate_light(
     """The light of an endoscope: response and spread, from a sparse map or from frames with known depth.
 
     Args:
-        data: folder of frames
-        output: light.json to write, with a report beside it (light.html)
-        map: COLMAP model(s) or a multi-map tree; left out, the frames' own true depth is needed
-        format: folder, video, c3vd, simcol, hamlyn, scared, endoslam, endomapper; found by looking if left out
-        camera: camera.json; left out, the map's own camera, else the folder's
-        mask: image, white where tissue shows
-        seed: draws the bootstrap
-        overwrite: replace files made before
+        data: Folder of frames, or video, whose light is sought.
+        output: File light.json to write, with a report beside it (light.html).
+        map: Sparse map of the frames: COLMAP model(s) or a multi-map tree; left out, the frames' own true depth is
+            needed.
+        format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
+            looking if left out.
+        camera: Calibration file, which wins over all others; left out, the map's own camera, else the folder's.
+        mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
+        seed: Number that draws the bootstrap samples. Another one gives slightly different intervals.
+        overwrite: Replace files that an earlier run made.
     """
     page_path = output.with_suffix(".html")
     if output.is_dir() or output.suffix == ".html":

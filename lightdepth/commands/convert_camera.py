@@ -23,13 +23,15 @@ def convert_camera(
     """A calibration file in another format, or as another lens model, and by how many pixels that differs.
 
     Args:
-        file: any calibration that is read: camera.json, vicalib XML, OpenCV YAML, COLMAP, ocamcalib, intrinsics.txt
-        output: file to write
-        model: lens model to have instead, fitted by least squares; left out, the file's own
-        size: width and height of the images; the camera is resized to them (intrinsics.txt holds none and needs them)
-        to: format of the output; left out, by its name
-        mask: image, white where tissue shows: only these pixels count in the fit
-        overwrite: replace a file made before
+        file: Calibration of any kind that is read: camera.json, vicalib XML, OpenCV YAML, COLMAP, ocamcalib or
+            intrinsics.txt.
+        output: File to write the camera to, in a format that its name tells.
+        model: Lens model to have instead, fitted by least squares; left out, the file's own.
+        size: Width and height of the images, pixels; the camera is resized to them (intrinsics.txt holds none and
+            needs them). A larger one makes a camera of larger images.
+        to: Format of the output; left out, the one that its name tells.
+        mask: Image, white where tissue shows: only these pixels count in the fit.
+        overwrite: Replace a file made before.
     """
     if output.exists() and not overwrite:
         raise InputError(f"{output}: already there; choose another -o, or give --overwrite")

@@ -42,12 +42,13 @@ def import_frames(
     """A video or a folder of frames as a sequence, without the patient's name, and a report on what is wrong with it.
 
     Args:
-        output: folder to make
-        overlay_mask: image, white where text is to be blacked out, besides what is found
-        find_text: look for burnt-in text
-        frames: false writes the report alone, with no image of the patient, fit for mailing
-        keep_names: let run.json and the report hold the names of files
-        overwrite: replace a folder made before
+        output: Folder to make, with the sequence and the report.
+        overlay_mask: Image, white where text is to be blacked out, besides what is found.
+        find_text: Look for burnt-in text, and black it out in the frames.
+        frames: Write the frames; switched off, only the report is written, with no image of the patient, fit for
+            mailing.
+        keep_names: Let run.json and the report hold the names of files.
+        overwrite: Replace a folder made before.
     """
     arguments = recorded(
         source,

@@ -25,11 +25,12 @@ def predict(
     """Distance, albedo and normals of every frame of a sequence, as one .npz a frame.
 
     Args:
-        output: folder to make
-        checkpoint: a path, the name of a bundled one, or decline (the closed form) or constant
-        refine: steps in which each image's distance is improved by its own light; 0 for none
-        previews: also write a PNG with image and distance for every frame
-        overwrite: replace a folder made before
+        output: Folder to make, with one .npz for each frame.
+        checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
+        refine: Number of steps in which each image's distance is improved by its own light; 0 for none. More follow
+            the light further and take longer.
+        previews: Also write a PNG with image and distance for every frame.
+        overwrite: Replace a folder made before.
     """
     arguments = recorded(source, output=output, checkpoint=checkpoint, refine=refine, previews=previews)
     model = load_model(checkpoint)

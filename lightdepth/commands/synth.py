@@ -71,12 +71,14 @@ def synth(
     """A synthetic colon sequence with exact truth, and a multi-map SLAM export with known wrong points.
 
     Args:
-        output: folder to make
-        layout: frames (our own folder), c3vd or endomapper (out1.png, ... and XML; its truth is in truth/sequence)
-        spurious: share of wrong map points; left out, slam.spurious
+        output: Folder to make, with the frames, their truth and the SLAM export.
+        layout: How files are laid out: frames (our own folder), c3vd, or endomapper (out1.png, ... and XML; its truth
+            is in truth/sequence).
+        spurious: Share of the map points that are wrong; left out, slam.spurious. A larger one makes the map harder
+            to densify.
         scene: ranges of shape, texture and sensor of plain colons
         slam: quality of the simulated SLAM
-        overwrite: replace a folder made before
+        overwrite: Replace a folder made before.
     """
     arguments = recorded(colon, output=output, layout=layout, spurious=spurious, scene=scene, slam=slam)
     slam = slam if spurious is None else replace(slam, spurious=spurious)

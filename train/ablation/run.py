@@ -140,14 +140,16 @@ def ablate(
     """What each ingredient of a training preset is worth: leave them out one by one, train, and compare.
 
     Args:
-        output: run folder; rows that are already in it, made with the same settings, are kept
-        base: training preset
-        settings: dotted options of `train`, changed for all rows
-        rows: the first is what the others are compared with; configs/ablation/lightdepth.yaml has some
-        judged: colons that no row is trained on
-        seeds: of colons, weights and order
-        table: Markdown file to write a copy of the table to
-        overwrite: make all rows anew
+        output: Run folder; rows that are already in it, made with the same settings, are kept.
+        base: Training preset that all rows start from, a YAML file.
+        settings: Dotted options of `train` and their values, changed for all rows.
+        rows: Trainings to compare; the first is what the others are compared with (configs/ablation/lightdepth.yaml
+            has some).
+        judged: Colons to judge on, which no row is trained on.
+        seeds: Numbers that draw colons, weights and order, one training of each row for each. More make the
+            comparison more certain and take longer.
+        table: Markdown file to write a copy of the table to.
+        overwrite: Make all rows anew, whatever is there.
     """
     started = time.time()
     arguments = recorded(

@@ -105,13 +105,13 @@ def adapt(
     """Adapt a checkpoint to another endoscope or organ, from frames without truth.
 
     Args:
-        output: run folder to make
-        checkpoint: a path or the name of a bundled one, to start from
-        more: other sequences of the same endoscope to learn from, such as '[A, B]'
-        map: sparse map of data; its points find the light where nobody gave it, and judge the result
-        fit_light: where nobody gave the light, fit it on the map and use it if withheld keyframes agree
-        keep_worse: write the model even when it got worse
-        overwrite: replace a run made before
+        output: Run folder to make, with the adapted model and a report.
+        checkpoint: Model to start from: a path, or the name of a bundled one.
+        more: Other sequences of the same endoscope to learn from, such as '[A, B]'.
+        map: Sparse map of the frames; its points find the light where nobody gave it, and judge the result.
+        fit_light: Where nobody gave the light, fit it on the map and use it if withheld keyframes agree.
+        keep_worse: Write the model even when it got worse.
+        overwrite: Replace a run made before.
     """
     if map is None and config.taught:
         raise InputError(

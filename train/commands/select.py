@@ -72,16 +72,17 @@ def select(
     """The frames worth training on, by covisibility: not blur, water, stool, nor walls too near.
 
     Args:
-        data: folder of frames
-        output: list to write, with a table (.csv), a contact sheet (_contact.png) and a page (.html) beside it
-        map: COLMAP model(s) or a multi-map tree, whose covisibility decides instead of matching images
-        matcher: sift, or loftr with --loftr.weights
-        format: folder, c3vd, simcol, hamlyn or endomapper; found by looking when left out
-        camera: calibration file that wins over the folder's
-        mask: image, white where tissue shows
-        with_folder: write names as folder/name, so that lists of several sequences can be joined
-        no_frames: leave the pictures out
-        overwrite: replace files made before
+        data: Folder of frames, or video, to choose from.
+        output: List to write, with a table (.csv), a contact sheet (_contact.png) and a page (.html) beside it.
+        map: Sparse map, COLMAP model(s) or a multi-map tree, whose covisibility decides instead of matching images.
+        matcher: What matches images: sift, or loftr, which needs --loftr.weights.
+        format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
+            looking if left out.
+        camera: Calibration file, which wins over the folder's own; left out, the folder's, else the map's.
+        mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
+        with_folder: Write names as folder/name, so that lists of several sequences can be joined.
+        no_frames: Leave the pictures of frames out of the page.
+        overwrite: Replace files that an earlier run made.
     """
     paths = _paths(output, no_frames, overwrite)
     sparse_map = read_map(map) if map is not None else None
