@@ -61,7 +61,7 @@ trainer: {max_steps: 10, accelerator: cpu, log_every_n_steps: 5}
 
 ITEMS: dict[str, list[str]] = {
     "synth": ["synth", "-o", "synth", "--frames", "16", *SMALL, "--seed", "3", "--lens", "fisheye"],
-    "c3vd": ["synth", "-o", "c3vd", "--frames", "6", *SMALL, "--layout", "c3vd", "--family", "realistic"],
+    "c3vd": ["synth", "-o", "c3vd", "--frames", "12", *SMALL, "--layout", "c3vd", "--family", "realistic"],
     "demo": ["demo", "-o", "demo", "--frames", "16", *SMALL],
     "bench": ["bench", "-o", "bench", "--checkpoints", "[decline]", "--image-size", "[96, 80]"],
     "sinus": ["densify", str(CLIP), "-o", "sinus", "--map", str(SINUS_MAP)],
