@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from types import ModuleType
@@ -17,7 +17,32 @@ from typing import TYPE_CHECKING, cast
 if TYPE_CHECKING:
     from importlib.abc import Loader, MetaPathFinder
 
-MOVED: dict[str, str] = {}
+MOVED: dict[str, str] = {
+    "densify.compiled": "densify.fusion.compiled",
+    "densify.judge": "densify.evaluation.judge",
+    "densify.marching": "densify.fusion.patches",
+    "densify.marching_cubes": "densify.fusion.marching_cubes",
+    "densify.packed": "densify.live.packed",
+    "densify.plain_fusion": "densify.fusion.plain",
+    "densify.play": "densify.live.play",
+    "densify.rectify": "densify.fusion.rectify",
+    "densify.retrieval": "lightdepth.sfm.retrieval",
+    "densify.second_core": "densify.fusion.second_core",
+    "densify.sfm": "lightdepth.sfm.reconstruction",
+    "densify.suite": "densify.evaluation.suite",
+    "densify.tables": "densify.evaluation.tables",
+    "densify.trajectory": "densify.evaluation.trajectory",
+    "densify.unmapped": "lightdepth.sfm.unmapped",
+    "lightdepth.figures": "lightdepth.reporting.figures",
+    "lightdepth.importing.measures": "lightdepth.image_quality",
+    "lightdepth.light_fit": "lightdepth.light.fit_on_map",
+    "lightdepth.light_page": "lightdepth.light.report",
+    "lightdepth.light_truth": "lightdepth.light.fit_on_truth",
+    "lightdepth.predict": "lightdepth.models",
+    "lightdepth.progress": "lightdepth.reporting.progress",
+    "lightdepth.report": "lightdepth.reporting.report",
+    "lightdepth.run": "lightdepth.reporting.run",
+}
 """Old name of a module -> new name."""
 
 
@@ -57,3 +82,20 @@ def install(moved: Mapping[str, str] = MOVED) -> None:
     """Has Python ask the table last; a second call changes nothing."""
     if not any(isinstance(finder, _Moved) and finder.moved is moved for finder in sys.meta_path):
         sys.meta_path.append(cast("MetaPathFinder", _Moved(moved)))
+
+
+def names_of(package: str, home: str) -> Callable[[str], object]:
+    """`__getattr__` of a package that was a module: the names that stood in it are those of its new home."""
+
+    def __getattr__(name: str) -> object:
+        if name.startswith("__"):
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        found = getattr(import_module(home), name)
+        warnings.warn(
+            f"{package}.{name} is now {home}.{name}; the old name goes with the next release",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return found
+
+    return __getattr__
