@@ -10,10 +10,10 @@ all keyframes minimise together
 
 with Geman-McClure's rho; s_i the deviation of the residuals at hand (from their lower quartile), never above what it
 was at the LMedS scale, or wrong points would widen it and be let in; o_ij that of the overlap (1.4826 median), but not
-below that of the points of i or j: depth maps agree best when all are flat, and must not count for more, the worse they
-then fit the points. Residuals are of the logarithm, because both a network and a triangulation err in proportion to the
-distance or faster. Solved by Gauss-Newton on sparse normal equations, with weights and projections renewed in every
-round; nothing in it is random.
+below that of the points of i or j. Flat depth maps agree perfectly. So the overlap's deviation is never taken below the
+points': a map that fits its points badly gains no weight by being flat. Residuals are of the logarithm, because both a
+network and a triangulation err in proportion to the distance or faster. Solved by Gauss-Newton on sparse normal
+equations, with weights and projections renewed in every round; nothing in it is random.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class BendingConfig:
 
     @property
     def precision(self) -> np.ndarray:
-        """Of the prior of w (m,): 0 for the scale, which is free."""
+        """Prior precision of each weight (m,); 0 for the scale, which has no prior."""
         if not self.on:
             return np.zeros(1)
         slope = [self.slope_deviation**-2] if self.slope_deviation else []

@@ -147,7 +147,7 @@ def _tensor(array: np.ndarray) -> Tensor:
 
 
 class _Kept:
-    """A mask as a key: itself, not what is in it. What is found by it holds it, so that no other takes its place."""
+    """Hashes a mask by identity. The cache entry keeps the mask alive, so its id cannot be reused."""
 
     def __init__(self, mask: np.ndarray) -> None:
         self.mask = mask

@@ -51,7 +51,7 @@ def observed_distances(keyframe: Keyframe, submap: Submap, prediction: DepthPred
 
 
 def unobserved(keyframe: Keyframe, submap: Submap, prediction: DepthPrediction) -> str:
-    """Why observations of a keyframe are of no use, counted: "" when all are."""
+    """Counts, by reason, of the observations that cannot be used; empty when every one can."""
     _, points, _ = submap.observed_points(keyframe)
     in_camera = keyframe.in_camera(points)
     pixels, seen = keyframe.camera.project(in_camera)

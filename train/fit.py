@@ -315,7 +315,9 @@ def _first_process() -> bool:
 
 
 class _Echo:
-    """Lines for the terminal and the run's log, from the first process only. A class: processes are handed it."""
+    """Lines for the terminal and the run's log, from the first process only.
+
+    A class, not a closure, because it is pickled to worker processes."""
 
     def __init__(self, log: Path) -> None:
         self.log = log

@@ -82,8 +82,10 @@ class TsdfVolume:
         self._held = np.zeros((2, 0), np.int64)  # packed places of all blocks, in order, and their slots
         self._free: list[int] = []
         self._codes = np.zeros(0, np.int64)
-        self._above = np.full((0, 8), -1, np.int32)  # the slots of the blocks at CORNERS from each; -1 where there is
-        self._below = np.full((0, 8), -1, np.int32)  # none; and of those that it is at CORNERS from
+        # Neighbour slots: _above[b, c] is the block at b + CORNERS[c], _below[b, c] the one at b - CORNERS[c]; -1 where
+        # there is none.
+        self._above = np.full((0, 8), -1, np.int32)
+        self._below = np.full((0, 8), -1, np.int32)
         self._behind = np.zeros((0, BLOCK**2), np.uint8)  # bit z of 8 x + y: a voxel behind the surface
         self._known = np.zeros((0, BLOCK**2), np.uint8)  # and one that enough views have seen
         self._weight = np.zeros((0, BLOCK**3), np.int32)

@@ -21,8 +21,8 @@ def ray_grid(camera: CameraModel, stride: int) -> np.ndarray:
 
 
 def surfaces_agree(target: Side, source: Side, similarity: Similarity) -> Agreement | None:
-    """How two surfaces lie to each other, as some keyframes of both see them; None where no camera sees enough of
-    both."""
+    """Gap, overlap and occlusion of two joined surfaces along the rays of up to eight keyframes of each; None where no
+    camera sees enough of both."""
     rays_seen = []
     own_from = {0: Similarity.identity(), 1: similarity.inverse()}
     for side, sim in ((target, Similarity.identity()), (source, similarity)):

@@ -72,13 +72,17 @@ class LiveMesh:
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """A keyframe, the positions (n, 3) of the points that it observed, how it was fused, and what it gave."""
+    """What is kept of a keyframe, so that it can be taken out of the volume and put in again."""
 
     keyframe: Keyframe
     points: np.ndarray
+    """positions (n, 3), in map units, of the points that it observed"""
     view: PackedView
+    """its image and prediction, packed"""
     alignment: Alignment
+    """how it was aligned when it was fused"""
     given: Contribution | None = None
+    """what it gave to the surface; None where it was not fused"""
 
 
 class Densifier:

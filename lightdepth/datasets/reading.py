@@ -31,9 +31,9 @@ def open_sequence(
 ) -> FrameSequence:
     """Frames at `path`, of a format found by looking or named; lazy but for a few frames that are checked.
 
-    `camera`, `light`, `mask` are files (light also `gamma=2.2,mu=0`) that win over what is in the folder;
-    `map_camera` serves where neither a file nor the format gives a camera, and wins over EndoMapper's calibration:
-    its own maps were made with other numbers. `check_sequence` says what is doubtful.
+    `light` and `mask` are files (light also `gamma=2.2,mu=0`) that win over what is in the folder. Camera, in order:
+    the file given; the format's own; the map's. For EndoMapper the map's wins, because its maps were not made with the
+    published calibration. `check_sequence` says what is doubtful.
     """
     path = Path(path)
     try:

@@ -46,8 +46,9 @@ def self_supervised_loss(
     seen: Seen | None = None,
     indirect: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted sum of all terms that need no truth, and the terms unweighted; those without weight are left out,
-    but for the five of the default.
+    """The weighted sum of all terms that need no truth, and the terms unweighted.
+
+    Terms of weight 0 are skipped, except the five in the default loss, which are always reported.
 
     `seen` and `indirect` are made from the images and the distance where they are not given. Without an albedo there
     is no chroma, and nothing but brightness can be compared.
