@@ -114,6 +114,7 @@ PAGES = {
             "lightdepth densify data/mine --map runs/slam -o runs/dense",
             "lightdepth densify data/mine -o runs/dense --mm-per-unit 3.1 --formats '[ply, glb]'",
         ),
+        rare=("keep_mb",),
         more=("fusion.voxel",),
     ),
     "live": Page(

@@ -362,7 +362,7 @@ def _in_words(kind: Any) -> str:
     if get_origin(kind) in (list, tuple) and parts:
         each = many.get(parts[0], expected(parts[0]))
         if get_origin(kind) is list or parts[1:] == (...,):
-            return f"a list of {each}" if parts[0] in many else f"a list, each of {each}"
+            return f"a list of {each}" if parts[0] in many else f"a list, each {each}"
         return f"{len(parts)} {each}, as {_placeholder(kind)}"
     if get_origin(kind) is dict or kind is dict:
         return "a mapping of names to values"

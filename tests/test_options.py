@@ -18,6 +18,7 @@ from typing import get_args, get_origin
 import pytest
 
 from lightdepth.cli import GROUP, main, verb_parser
+from lightdepth.datasets import FORMATS, FormatName
 from lightdepth.pages import PAGES
 from lightdepth.parsing import Parser, options, parsed
 
@@ -98,6 +99,10 @@ def test_every_option_of_a_group_says_what_it_is_its_unit_and_what_more_of_it_do
 @every_verb
 def test_every_plain_option_says_what_it_is_its_unit_and_what_more_of_it_does(verb):
     assert mute(verb, dotted=False) == {}
+
+
+def test_the_formats_that_can_be_named_are_those_that_are_read():
+    assert set(get_args(FormatName)) == set(FORMATS)
 
 
 def test_the_rule_finds_an_option_that_says_too_little():
@@ -192,6 +197,13 @@ MISTAKES = {
     "nothing is like it": ("densify", ["D", "-o", "O", "--qqq", "1"], "no option --qqq. Read on"),
     "dashes": ("densify", ["D", "-o", "O", "--mm-per-unt", "3"], "--mm_per_unit?"),
     "choice": ("synth", ["-o", "O", "--layout", "c3d"], "one of frames, c3vd, endomapper; did you mean c3vd?"),
+    "format": ("densify", ["D", "-o", "O", "--format", "colmap"], "--format colmap: expected one of folder, c3vd"),
+    "lens": ("synth", ["-o", "O", "--lens", "rear"], "--lens rear: expected one of pinhole, telescope, fisheye, c3vd."),
+    "mesh": (
+        "densify",
+        ["D", "-o", "O", "--formats", "stl"],
+        "each one of ply, glb, obj",
+    ),
     "choice in a list": ("densify", ["D", "-o", "O", "--merging.by", "point"], "did you mean points?"),
     "choice of train": ("train", ["-o", "O", "--model.network.kind", "unett"], "did you mean unet?"),
     "number": ("densify", ["D", "-o", "O", "--alignment.t", "wide"], "--alignment.t wide: expected a number."),

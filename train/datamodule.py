@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import lightning.pytorch as pl
 import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
-from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.splits import check_apart, folders, read_split
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, flipped, to_batch
@@ -44,7 +45,7 @@ class FrameData:
     frames: str | None = None
     """File with one frame name a line, as `select` writes it; training takes exactly these, and what is held out to
     validate on comes from them. `folder/name` where several sequences have frames of one name."""
-    format: str | None = None
+    format: FormatName | None = None
     """Format of the sequences: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking
     if left out."""
     camera: str | None = None
@@ -99,7 +100,8 @@ class FrameData:
     def source(self, path: str, format: str | None = None) -> SequenceSource:
         """How the sequence at `path` is read; `format` is that of its data set, where it is known."""
         camera, mask = (None if file is None else Path(file) for file in (self.camera, self.mask))
-        return SequenceSource(Path(path), self.format or format, camera, self.light, mask)
+        known = cast("FormatName | None", format)  # dataset.yaml's is one of them: read_dataset_yaml looks
+        return SequenceSource(Path(path), self.format or known, camera, self.light, mask)
 
 
 class FrameDataModule(pl.LightningDataModule):

@@ -14,8 +14,8 @@ from lightdepth.datasets import open_sequence
 from lightdepth.maps import read_map
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
+from lightdepth.tube import Lens, render_sequence
 from lightdepth.tube import lens as tube_lens
-from lightdepth.tube import render_sequence
 from lightdepth.tube.export import write_synthetic
 from lightdepth.tube.slam import SlamConfig, simulate_slam
 
@@ -26,7 +26,7 @@ def demo(
     frames: int = 40,
     seed: int = 7,
     size: tuple[int, int] = (320, 256),
-    lens: str = "c3vd",
+    lens: Lens = "c3vd",
     spurious: float = 0.3,
     withhold: float = 0.2,
     overwrite: bool = False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
@@ -24,7 +25,7 @@ def densify(
     checkpoint: str = DEFAULT_CHECKPOINT,
     config: Group[DensifyConfig] = DensifyConfig(),
     sfm: SfmConfig = SfmConfig(),
-    formats: tuple[str, ...] = ("ply",),
+    formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply",),
     mm_per_unit: float | None = None,
     fit_light: bool = True,
     merge: bool = True,
@@ -47,8 +48,7 @@ def densify(
         merging: when two submaps are one
         overwrite: Replace a run made before.
     """
-    unknown = set(formats) - {"ply", "glb", "obj"}
-    if unknown or "ply" not in formats:
+    if "ply" not in formats:
         raise InputError(f"--formats {list(formats)}; expected ply, and besides it glb and obj if wanted")
     check_unit(mm_per_unit)
     model = load_model(checkpoint, details=False)  # before minutes are spent on a sparse map

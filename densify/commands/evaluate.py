@@ -31,7 +31,7 @@ from densify.evaluation.tables import write_evaluations
 from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.inputs import check_unit, map_and_frames
 from lightdepth.checkpoint import load_model
-from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.models import DepthModel
 from lightdepth.options import Group
@@ -47,7 +47,7 @@ class TruthSource:
 
     truth: Path | None = None
     """Sequence with true depth, and for maps with true poses; left out, a densify run's withheld points judge."""
-    format: str | None = None
+    format: FormatName | None = None
     """Format of the truth: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if
     left out."""
     camera: Path | None = None

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.inputs import made_sparse
-from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
 from lightdepth.reporting.run import recorded, run_folder
@@ -17,7 +17,7 @@ from lightdepth.sfm.reconstruction import SfmConfig
 def sparse(
     data: Path,
     output: Path,
-    format: str | None = None,
+    format: FormatName | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
     poses: str | None = None,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lightdepth.calibration import write_light
-from lightdepth.datasets import SequenceSource
+from lightdepth.datasets import FormatName, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.files.writing import write_together
 from lightdepth.light.fit_on_map import fit_on_map
@@ -20,7 +20,7 @@ def calibrate_light(
     data: Path,
     output: Path,
     map: Path | None = None,
-    format: str | None = None,
+    format: FormatName | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
     seed: int = 0,

@@ -12,8 +12,8 @@ from lightdepth.errors import InputError
 from lightdepth.options import Group
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
+from lightdepth.tube import Lens, render_sequence
 from lightdepth.tube import lens as tube_lens
-from lightdepth.tube import render_sequence
 from lightdepth.tube.export import write_synthetic
 from lightdepth.tube.scene import TubeConfig, realistic
 from lightdepth.tube.sequence import TubeSequence
@@ -24,7 +24,7 @@ from lightdepth.tube.slam import SlamConfig, simulate_slam
 class ColonConfig:
     """A synthetic colon, the endoscope in it, and the way that it takes."""
 
-    lens: str = "c3vd"
+    lens: Lens = "c3vd"
     """Lens of the endoscope: pinhole, telescope, fisheye or c3vd."""
     frames: int = 40
     """Number of frames to render. More make a longer sequence and take longer."""

@@ -5,7 +5,7 @@ from lightdepth.datasets.endomapper import read_endomapper, write_endomapper
 from lightdepth.datasets.endoslam import read_endoslam, write_endoslam
 from lightdepth.datasets.folder import read_folder, write_folder
 from lightdepth.datasets.hamlyn import read_hamlyn, write_hamlyn
-from lightdepth.datasets.reading import FORMATS, open_sequence
+from lightdepth.datasets.reading import FORMATS, FormatName, open_sequence
 from lightdepth.datasets.scared import read_scared
 from lightdepth.datasets.scared_writing import write_scared
 from lightdepth.datasets.sequence import FrameSequence
@@ -15,6 +15,7 @@ from lightdepth.datasets.video import VideoFile, read_video
 
 __all__ = [
     "FORMATS",
+    "FormatName",
     "FrameSequence",
     "SequenceSource",
     "VideoFile",

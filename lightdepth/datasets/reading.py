@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
@@ -18,6 +19,7 @@ from lightdepth.frame import check_image_size
 _DATA_SETS = (c3vd.FORMAT, simcol.FORMAT, hamlyn.FORMAT, scared.FORMAT, endoslam.FORMAT, endomapper.FORMAT)
 _BY_NAME = {data_set.name: data_set for data_set in (folder.FORMAT, *_DATA_SETS)}
 FORMATS = (*_BY_NAME, "video")
+FormatName = Literal["folder", "c3vd", "simcol", "hamlyn", "scared", "endoslam", "endomapper", "video"]
 _DEEP, _MANY = 3, 200  # folders within which sequences are looked for, to name them, and entries of each
 
 

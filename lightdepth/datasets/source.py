@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.reading import open_sequence
+from lightdepth.datasets.reading import FormatName, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
 
 
@@ -16,7 +16,7 @@ class SequenceSource:
 
     data: Path
     """Folder of frames, or a video, of any format that is read."""
-    format: str | None = None
+    format: FormatName | None = None
     """Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if
     left out."""
     camera: Path | None = None

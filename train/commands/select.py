@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.files.writing import Content, write_together
 from lightdepth.maps import read_map
@@ -61,7 +61,7 @@ def select(
     output: Path,
     map: Path | None = None,
     matcher: Literal["sift", "loftr"] = "sift",
-    format: str | None = None,
+    format: FormatName | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
     config: Group[SelectConfig] = SelectConfig(),
