@@ -106,7 +106,8 @@ class View(Brief):
         down = max(2, round(samples * height / width))
         y, x = np.meshgrid((np.arange(down) + 0.5) / down, (np.arange(samples) + 0.5) / samples, indexing="ij")
         places = np.stack([x.ravel(), y.ravel()], 1)
-        return places[self.at(places)[1]]
+        result: np.ndarray = places[self.at(places)[1]]
+        return result
 
 
 def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, bending: BendingConfig) -> list[Bend]:
@@ -203,7 +204,8 @@ class _Places:
 
 def _residual(view: View, bend: Bend, places: _Places) -> np.ndarray:
     o = view.observed
-    return np.log(o.mapped) - np.log(o.predicted) - places.at_points @ bend.weights
+    result: np.ndarray = np.log(o.mapped) - np.log(o.predicted) - places.at_points @ bend.weights
+    return result
 
 
 def _point_rows(index: int, view: View, bend: Bend, places: _Places, most: float) -> _Rows:

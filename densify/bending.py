@@ -83,7 +83,8 @@ class Bend(Brief):
 
     def at(self, pixels: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """f (n,) at pixels (n, 2) with predicted distance (n,)."""
-        return self.basis(pixels / self.image_size, np.log(predicted)) @ self.weights
+        result: np.ndarray = self.basis(pixels / self.image_size, np.log(predicted)) @ self.weights
+        return result
 
     def field(self, log_distance: np.ndarray) -> np.ndarray:
         """f (H, W) over an image of log predicted distances (H, W)."""
@@ -116,4 +117,5 @@ def _bumps(x: np.ndarray, n: int) -> np.ndarray:
 @lru_cache(maxsize=8)
 def _mean(n: int) -> np.ndarray:
     """Of each bump (n,) over [0, 1]."""
-    return _bumps((np.arange(256) + 0.5) / 256, n).mean(0)
+    result: np.ndarray = _bumps((np.arange(256) + 0.5) / 256, n).mean(0)
+    return result

@@ -76,4 +76,5 @@ def _judges(shared: np.ndarray, own: int, most: int) -> list[int]:
 
 def _cells(x: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Row and column (n, 2) of x (n, 2) in [0, 1]² on a grid of that shape."""
-    return np.clip((x[:, ::-1] * shape).astype(int), 0, np.array(shape) - 1)
+    result: np.ndarray = np.clip((x[:, ::-1] * shape).astype(int), 0, np.array(shape) - 1)
+    return result

@@ -54,7 +54,8 @@ class Surface:
         if self._scene is None or not len(points):
             return np.full(len(points), np.inf)
         found = self._scene.compute_distance(self._core.Tensor(points.astype(np.float32)))
-        return found.numpy().astype(np.float64)
+        result: np.ndarray = found.numpy().astype(np.float64)
+        return result
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The points (n, 3) of the surface that are closest to points (n, 3), and their triangles (n,)."""

@@ -21,7 +21,8 @@ class Similarity:
     translation: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        return self.scale * points @ self.rotation.T + self.translation
+        result: np.ndarray = self.scale * points @ self.rotation.T + self.translation
+        return result
 
     def __matmul__(self, first: Similarity) -> Similarity:
         """self after first."""

@@ -126,12 +126,14 @@ def _pixel_residuals(trial: CameraModel, rays: np.ndarray, pixels: np.ndarray) -
         if isinstance(trial, Brown):
             plane = trial._distort(plane)
     assert isinstance(trial, Pinhole | Brown | KannalaBrandt)
-    return trial._to_pixels(plane) - pixels
+    result: np.ndarray = trial._to_pixels(plane) - pixels
+    return result
 
 
 def _ray_residuals(trial: CameraModel, rays: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """In ray space, where Scaramuzza's model is a formula, scaled to pixels at the axis."""
-    return (trial.unproject(pixels)[0] - rays) * trial.focal_length
+    result: np.ndarray = (trial.unproject(pixels)[0] - rays) * trial.focal_length
+    return result
 
 
 _RESIDUALS: dict[type[CameraModel], _Residuals] = {

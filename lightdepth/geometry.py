@@ -6,9 +6,14 @@ distance and depth (B, 1, H, W), of rays, points and normals (B, 3, H, W), unles
 
 from __future__ import annotations
 
+from typing import TypeVar
+
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+Values = TypeVar("Values", np.ndarray, Tensor)
 
 
 def length(vectors: Tensor) -> Tensor:
@@ -19,14 +24,16 @@ def length(vectors: Tensor) -> Tensor:
     return vectors.square().sum(-3, keepdim=True).clamp(min=1e-24).sqrt()
 
 
-def depth_from_distance(distance, ray_z):
+def depth_from_distance(distance: Values, ray_z: Values) -> Values:
     """z = t r_z, elementwise on arrays or tensors."""
-    return distance * ray_z
+    depth: Values = distance * ray_z
+    return depth
 
 
-def distance_from_depth(depth, ray_z):
+def distance_from_depth(depth: Values, ray_z: Values) -> Values:
     """t = z / r_z, elementwise on arrays or tensors. The caller keeps to rays with r_z > 0."""
-    return depth / ray_z
+    distance: Values = depth / ray_z
+    return distance
 
 
 def normals_from_distance(distance: Tensor, rays: Tensor) -> Tensor:

@@ -39,7 +39,8 @@ class Measures:
 
     @property
     def readable(self) -> np.ndarray:
-        return np.isfinite(self.brightness)
+        result: np.ndarray = np.isfinite(self.brightness)
+        return result
 
 
 class Meter:

@@ -7,7 +7,7 @@ log distance is interpolated, so that halfway between t and 4t lies 2t.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -74,7 +74,7 @@ class NetworkModel:
     """A trained network, run at images of `rows` rows. `card` says what it was trained on."""
 
     def __init__(
-        self, network: DepthNetwork, rows: int, name: str, card: dict | None = None, details: bool = True
+        self, network: DepthNetwork, rows: int, name: str, card: dict[str, Any] | None = None, details: bool = True
     ) -> None:
         self.network = network.eval()
         self.rows, self.name, self.card, self.details = rows, name, card or {}, details
@@ -137,7 +137,8 @@ def _valid(frame: Frame) -> np.ndarray:
     """(H, W) bool: inside mask and lens, and not black."""
     # A chain of comparisons is ten times as fast as the maximum over the last axis.
     red, green, blue = (frame.image[..., channel] for channel in range(3))
-    return frame.valid & (np.maximum(np.maximum(red, green), blue) > V_FLOOR)
+    result: np.ndarray = frame.valid & (np.maximum(np.maximum(red, green), blue) > V_FLOOR)
+    return result
 
 
 def extended(values: Tensor, mask: Tensor, steps: int = 2) -> Tensor:

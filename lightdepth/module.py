@@ -89,7 +89,8 @@ class LightDepth(pl.LightningModule):
 
     def forward(self, batch: FrameBatch) -> tuple[Tensor, Tensor]:
         """Distance (B, 1, H, W) and albedo as hue and saturation (B, 2, H, W)."""
-        return self.network(batch.image, batch.mask, batch.rays, batch.light)
+        result: tuple[Tensor, Tensor] = self.network(batch.image, batch.mask, batch.rays, batch.light)
+        return result
 
     def estimate(self, batch: FrameBatch) -> Estimate:
         """Distance, albedo and uncertainty."""

@@ -79,5 +79,5 @@ def warp() -> ModuleType:
             "'lightdepth[gpu]'; or render on the CPU"
         ) from error
     warp.config.log_level = warp.LOG_ERROR  # or it greets, and warns where there is no GPU
-    warp.init()
+    warp.init()  # type: ignore[no-untyped-call]  # Warp has no annotation for it
     return warp

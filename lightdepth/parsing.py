@@ -42,7 +42,7 @@ class Formatter(DefaultHelpFormatter):
     """Help as wide as a terminal mostly is, whatever this one's width: so that it reads the same everywhere."""
 
     def __init__(self, prog: str, **settings: Any) -> None:
-        super().__init__(prog, **{**settings, "width": _WIDTH, "max_help_position": 28})
+        super().__init__(prog, **{**settings, "width": _WIDTH, "max_help_position": 28})  # type: ignore[no-untyped-call]  # jsonargparse has no annotation for it
 
     def _get_help_string(self, action: argparse.Action) -> str:
         """The sentence, and in brackets what kind of value is taken, where its placeholder does not show it."""

@@ -88,7 +88,7 @@ def refine(log_start: Tensor, batch: FrameBatch, config: RefineConfig) -> Tensor
             if not torch.isfinite(total):
                 break
             optimizer.zero_grad()
-            total.backward()
+            total.backward()  # type: ignore[no-untyped-call]  # torch has no annotation for it
             optimizer.step()
             schedule.step()
         return current().detach()

@@ -95,7 +95,8 @@ def robust_weights(x: np.ndarray, loss: Loss = "geman_mcclure") -> np.ndarray:
         case "geman_mcclure":
             return 1 / (1 + x**2) ** 2
         case "huber":
-            return HUBER / np.maximum(np.abs(x), HUBER)
+            result: np.ndarray = HUBER / np.maximum(np.abs(x), HUBER)
+            return result
         case "cauchy":
             return 1 / (1 + (x / CAUCHY) ** 2)
         case "tukey":

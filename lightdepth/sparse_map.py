@@ -41,11 +41,13 @@ class Keyframe(Brief):
     @property
     def center(self) -> np.ndarray:
         """Camera centre in the map (3,)."""
-        return -self.cam_from_map[:3, :3].T @ self.cam_from_map[:3, 3]
+        result: np.ndarray = -self.cam_from_map[:3, :3].T @ self.cam_from_map[:3, 3]
+        return result
 
     def in_camera(self, points: np.ndarray) -> np.ndarray:
         """Map points (n, 3) in camera axes."""
-        return points @ self.cam_from_map[:3, :3].T + self.cam_from_map[:3, 3]
+        result: np.ndarray = points @ self.cam_from_map[:3, :3].T + self.cam_from_map[:3, 3]
+        return result
 
 
 @dataclass(frozen=True, eq=False, repr=False)

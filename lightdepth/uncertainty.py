@@ -89,7 +89,8 @@ def sparsification(frames: Iterable[Doubted], power: int = 1) -> Sparsification:
         kept = len(size) - (len(size) * _DROPPED).astype(int)
 
         def left(order: np.ndarray, size: np.ndarray = size, kept: np.ndarray = kept) -> np.ndarray:
-            return (np.cumsum(size[order]) / np.arange(1, len(size) + 1))[kept - 1] ** (1 / power)
+            result: np.ndarray = (np.cumsum(size[order]) / np.arange(1, len(size) + 1))[kept - 1] ** (1 / power)
+            return result
 
         flat = np.full(len(kept), size.mean() ** (1 / power))
         curves.append((left(np.argsort(frame.sigma, kind="stable")), left(np.argsort(size)), flat))
@@ -101,7 +102,10 @@ def sparsification(frames: Iterable[Doubted], power: int = 1) -> Sparsification:
 def coverage(frames: Sequence[Doubted], levels: Sequence[float] | np.ndarray = LEVELS) -> np.ndarray:
     """Share of pixels inside the central normal interval of each level, mean over frames (len(levels),)."""
     factors = norm.ppf((1 + np.asarray(levels)) / 2)
-    return np.mean([(np.abs(f.error)[:, None] <= factors * f.sigma[:, None]).mean(0) for f in frames], axis=0)
+    result: np.ndarray = np.mean(
+        [(np.abs(f.error)[:, None] <= factors * f.sigma[:, None]).mean(0) for f in frames], axis=0
+    )
+    return result
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,7 @@ def fit_calibration(frames: Sequence[Doubted]) -> Calibration:
     def cost(exponent: float) -> float:
         # With the best scale for this exponent, a normal density's log likelihood is -log s - exponent mean(log sigma).
         square = np.mean([np.mean((f.error / f.sigma**exponent) ** 2) for f in frames])
-        return 0.5 * np.log(max(square, 1e-300)) + exponent * np.mean([np.log(f.sigma).mean() for f in frames])
+        return float(0.5 * np.log(max(square, 1e-300)) + exponent * np.mean([np.log(f.sigma).mean() for f in frames]))
 
     exponent = float(minimize_scalar(cost, bounds=(0.1, 4.0), method="bounded").x)
     ratio = [np.abs(f.error) / f.sigma**exponent for f in frames]

@@ -34,7 +34,8 @@ REACH = 1 << _BITS - 1
 def packed(places: np.ndarray) -> np.ndarray:
     """Places (n, 3) as one int64 each, (n,); in their order."""
     x, y, z = (places.astype(np.int64) + REACH).T
-    return x << 2 * _BITS | y << _BITS | z
+    result: np.ndarray = x << 2 * _BITS | y << _BITS | z
+    return result
 
 
 def unpacked(codes: np.ndarray) -> np.ndarray:
@@ -118,7 +119,8 @@ class Cut(NamedTuple):
     @property
     def positions(self) -> np.ndarray:
         """(v, 3) in voxels."""
-        return _positions(self.names, self.share)
+        result: np.ndarray = _positions(self.names, self.share)
+        return result
 
 
 def cut(
@@ -156,7 +158,17 @@ def one_vertex_an_edge(names: np.ndarray, triangles: np.ndarray) -> tuple[np.nda
 
 
 @compiled
-def _cut(distance, weight, behind, known, above, codes, slots, cases, counts):
+def _cut(
+    distance: np.ndarray,
+    weight: np.ndarray,
+    behind: np.ndarray,
+    known: np.ndarray,
+    above: np.ndarray,
+    codes: np.ndarray,
+    slots: np.ndarray,
+    cases: np.ndarray,
+    counts: np.ndarray,
+) -> tuple[np.ndarray, ...]:
     names, near, far = np.empty(8192, np.int64), np.empty(8192, np.int64), np.empty(8192, np.int64)
     share = np.empty(8192, np.float64)
     corners = np.empty(49152, np.uint16)
@@ -186,7 +198,16 @@ def _cut(distance, weight, behind, known, above, codes, slots, cases, counts):
 
 
 @compiled
-def _cut_cells(behind, known, around, cases, counts, vertex_at, edges, corners):
+def _cut_cells(
+    behind: np.ndarray,
+    known: np.ndarray,
+    around: np.ndarray,
+    cases: np.ndarray,
+    counts: np.ndarray,
+    vertex_at: np.ndarray,
+    edges: np.ndarray,
+    corners: np.ndarray,
+) -> tuple[int, int]:
     """Writes the corners of a block's triangles, as numbers of vertices, and the edges that these lie on; how many
     vertices and corners there are. `vertex_at` is -1 for all edges, and then the number of an edge's vertex."""
     behinds, knowns = np.zeros((9, 9), np.int64), np.zeros((9, 9), np.int64)  # with the border; bit z of x, y
@@ -228,7 +249,17 @@ def _cut_cells(behind, known, around, cases, counts, vertex_at, edges, corners):
 
 
 @compiled
-def _place_vertices(distance, weight, around, code, edges, names, near, far, share):
+def _place_vertices(
+    distance: np.ndarray,
+    weight: np.ndarray,
+    around: np.ndarray,
+    code: int,
+    edges: np.ndarray,
+    names: np.ndarray,
+    near: np.ndarray,
+    far: np.ndarray,
+    share: np.ndarray,
+) -> None:
     """Where the surface crosses the edges (n,) of a block."""
     t_sums, w_sums = distance.reshape(-1), weight.reshape(-1)
     mask = (1 << _BITS) - 1
@@ -246,7 +277,7 @@ def _place_vertices(distance, weight, around, code, edges, names, near, far, sha
 
 
 @compiled
-def _positions(names, share):
+def _positions(names: np.ndarray, share: np.ndarray) -> np.ndarray:
     positions, mask = np.empty((len(names), 3), np.float64), (1 << _BITS) - 1
     for i in range(len(names)):
         place, axis = names[i] // 3, names[i] % 3
@@ -258,7 +289,7 @@ def _positions(names, share):
 
 
 @compiled
-def _longer(array):
+def _longer(array: np.ndarray) -> np.ndarray:
     out = np.empty(2 * len(array) + 8192, array.dtype)
     for i in range(len(array)):  # a slice would take seconds to compile
         out[i] = array[i]

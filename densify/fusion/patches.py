@@ -75,7 +75,15 @@ class BlockSurface:
 
 
 @compiled
-def _in_patches(vertices, names, colors, triangles, first_vertex, first_triangle, ends):
+def _in_patches(
+    vertices: np.ndarray,
+    names: np.ndarray,
+    colors: np.ndarray,
+    triangles: np.ndarray,
+    first_vertex: np.ndarray,
+    first_triangle: np.ndarray,
+    ends: np.ndarray,
+) -> np.ndarray:
     """The memory of patches that end at `ends` (k,), in pieces of eight bytes."""
     data = np.zeros(ends[-1] if len(ends) else 0, np.int64)
     singles, shorts, bytes_ = data.view(np.float32), data.view(np.uint16), data.view(np.uint8)

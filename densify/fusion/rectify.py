@@ -157,9 +157,23 @@ def light_weight(value: np.ndarray, config: RectifyConfig) -> np.ndarray:
 
 @compiled
 def _planes(
-    points, distance, near, valid, edge, trust, color, rays, gaps_u, gaps_v, max_slope,
-    first, end, planes, weights, colors,
-):  # fmt: skip
+    points: np.ndarray,
+    distance: np.ndarray,
+    near: np.ndarray,
+    valid: np.ndarray,
+    edge: np.ndarray,
+    trust: np.ndarray,
+    color: np.ndarray,
+    rays: np.ndarray,
+    gaps_u: np.ndarray,
+    gaps_v: np.ndarray,
+    max_slope: np.float32,
+    first: int,
+    end: int,
+    planes: np.ndarray,
+    weights: np.ndarray,
+    colors: np.ndarray,
+) -> None:
     """Fills in the planes (n, 4), weights (n,) and colours (n, 4), all of them 0, of the rows of pixels first to end.
 
     The normal is P_u x P_v, away from the camera, with differences of P to both sides, or to one where the other is
@@ -226,7 +240,15 @@ def _merge(values: np.ndarray, valid: np.ndarray, size: int) -> np.ndarray:
 
 
 @compiled
-def _look_up(cells, scale, origins, offsets, first, end, pixels):
+def _look_up(
+    cells: np.ndarray,
+    scale: np.ndarray,
+    origins: np.ndarray,
+    offsets: np.ndarray,
+    first: int,
+    end: int,
+    pixels: np.ndarray,
+) -> None:
     # Choices instead of min and max, and the table in a loop of its own: so the first is done eight at a time.
     count, places, size = offsets.shape[1], cells.reshape(-1), np.int32(len(cells))
     half, last, zero = np.float32(size / 2), np.float32(size - 1), np.float32(0)
@@ -268,7 +290,10 @@ def _in_pinhole(camera: CameraModel) -> np.ndarray:
     center = camera.project(np.array([0.0, 0.0, 1.0]))[0]
     front = valid & (rays[..., 2] > 1e-6)
     place = camera.focal_length * rays[..., :2] / np.where(front, rays[..., 2], 1)[..., None] + center
-    return front & (place >= 0).all(-1) & (place[..., 0] <= camera.width) & (place[..., 1] <= camera.height)
+    result: np.ndarray = (
+        front & (place >= 0).all(-1) & (place[..., 0] <= camera.width) & (place[..., 1] <= camera.height)
+    )
+    return result
 
 
 def _table(camera: CameraModel, merged: int, largest: int = 2500) -> DirectionTable:

@@ -127,7 +127,8 @@ class TsdfVolume:
         touched = np.unique(self._below[slots])
         codes = self._codes[touched[touched >= 0]]
         self._release(slots[~any_left])
-        return codes
+        result: np.ndarray = codes
+        return result
 
     def _touched(self, view: SurfaceView, cam_from_map: np.ndarray) -> np.ndarray:
         """Places (n, 3), in order, of the blocks that the surface of a view passes through or comes close to."""
@@ -154,7 +155,8 @@ class TsdfVolume:
             )
         touched = np.zeros(shape, bool)
         _mark(touched, near, low)
-        return np.argwhere(touched) + low
+        result: np.ndarray = np.argwhere(touched) + low
+        return result
 
     def _hold(self, codes: np.ndarray) -> np.ndarray:
         """The slots (n,) of blocks, which are given one where they have none."""
@@ -209,7 +211,8 @@ class TsdfVolume:
     @property
     def places(self) -> np.ndarray:
         """Packed places (n,) of all blocks that hold anything, in order."""
-        return self._held[0].copy()
+        result: np.ndarray = self._held[0].copy()
+        return result
 
     def cut(self, slots: np.ndarray) -> Cut:
         """The surface in the blocks at slots (n,)."""
@@ -217,7 +220,8 @@ class TsdfVolume:
 
     def colors_at(self, found: Cut) -> np.ndarray:
         """Colours (v, 3) float32, 0 to 255, of the vertices of a cut."""
-        return _mean_colors(self._color.reshape(-1, 4), found.near, found.far, found.share)
+        result: np.ndarray = _mean_colors(self._color.reshape(-1, 4), found.near, found.far, found.share)
+        return result
 
     def extract_mesh(self) -> Mesh:
         """The whole surface; empty when nothing was seen. A cell with a corner that too few views saw has none."""
@@ -240,10 +244,27 @@ _CODE_STEPS = packed(CORNERS) - packed(np.zeros((1, 3), int))  # to the eight co
 
 @compiled
 def _add_view(
-    weight, distance, seen, color, behind, known, slots,
-    origins, offsets, pixels, planes, weights, colors,
-    tau, colored, sign, least, first, end, any_left,
-):  # fmt: skip
+    weight: np.ndarray,
+    distance: np.ndarray,
+    seen: np.ndarray,
+    color: np.ndarray,
+    behind: np.ndarray,
+    known: np.ndarray,
+    slots: np.ndarray,
+    origins: np.ndarray,
+    offsets: np.ndarray,
+    pixels: np.ndarray,
+    planes: np.ndarray,
+    weights: np.ndarray,
+    colors: np.ndarray,
+    tau: float,
+    colored: np.float32,
+    sign: int | np.int32,
+    least: int,
+    first: int,
+    end: int,
+    any_left: np.ndarray,
+) -> None:
     """Adds sign times what a view says to the sums of the blocks at slots (n,), first to end. The voxels of a block are
     at its origin (n, 3) + offsets (3, 512), in camera axes, and in its pixels (n, 512). Whether a block holds anything
     then goes into any_left (n,)."""
@@ -292,7 +313,15 @@ def _add_view(
 
 
 @compiled
-def _blocks_near(points, planes, some, tau, across, rotation, shift):
+def _blocks_near(
+    points: np.ndarray,
+    planes: np.ndarray,
+    some: np.ndarray,
+    tau: float,
+    across: float,
+    rotation: np.ndarray,
+    shift: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places (5 n, 3) int32 of the blocks at the points of some pixels (n,), tau before and behind them along the ray,
     as far as the view speaks, and `across` to both sides of the surface, where marching cubes needs a neighbour; the
     lowest (3,) and the highest (3,)."""
@@ -316,14 +345,14 @@ def _blocks_near(points, planes, some, tau, across, rotation, shift):
 
 
 @compiled
-def _mark(marked, places, low):
+def _mark(marked: np.ndarray, places: np.ndarray, low: np.ndarray) -> None:
     """Sets marked (x, y, z) at places (n, 3), counted from `low`."""
     for i in range(len(places)):
         marked[places[i, 0] - low[0], places[i, 1] - low[1], places[i, 2] - low[2]] = True
 
 
 @compiled
-def _mean_colors(color, near, far, share):
+def _mean_colors(color: np.ndarray, near: np.ndarray, far: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Mean colours (n, 3) from weighted sums (m, 4), `share` of the way between rows `near` and `far` (n,) of them."""
     out = np.empty((len(share), 3), np.float32)
     for i in range(len(share)):

@@ -134,7 +134,8 @@ def _root(path: Path) -> Element:
         raise InputError(f"{path}: not valid XML ({error})") from error
     if root.tag == "opencv_storage":
         raise InputError(f"{path}: OpenCV's XML; expected vicalib's. Save it as .yaml, which is read")
-    return root
+    result: Element = root
+    return result
 
 
 def _only(root: Element, tag: str, path: Path) -> Element:

@@ -39,7 +39,8 @@ def detached(array: Array) -> Array:
 def length(x: Array, y: Array) -> Array:
     """sqrt(x² + y²), with gradient 0 at 0."""
     if not isinstance(x, Tensor):
-        return np.hypot(x, y)
+        result: Array = np.hypot(x, y)
+        return result
     zero = (x == 0) & (y == 0)
     return torch.where(zero, 0.0, torch.hypot(torch.where(zero, 1.0, x), y))
 
@@ -47,7 +48,8 @@ def length(x: Array, y: Array) -> Array:
 def interpolated(at: Array, knots: np.ndarray, values: np.ndarray) -> Array:
     """np.interp, without gradient: the first guess of a root."""
     if not isinstance(at, Tensor):
-        return np.interp(at, knots, values)
+        result: Array = np.interp(at, knots, values)
+        return result
     at = at.detach().contiguous()
     x, y = (torch.as_tensor(table, dtype=at.dtype, device=at.device) for table in (knots, values))
     i = torch.searchsorted(x, at).clamp(1, len(x) - 1)
@@ -55,13 +57,15 @@ def interpolated(at: Array, knots: np.ndarray, values: np.ndarray) -> Array:
 
 
 def unit(vectors: Array) -> Array:
-    return vectors / namespace(vectors).linalg.norm(vectors, axis=-1, keepdims=True)
+    result: Array = vectors / namespace(vectors).linalg.norm(vectors, axis=-1, keepdims=True)
+    return result
 
 
 def scaled(points: Array, scale: tuple[float, float], offset: tuple[float, float]) -> Array:
     """points (..., 2) * scale + offset."""
     x, y = points[..., 0] * scale[0] + offset[0], points[..., 1] * scale[1] + offset[1]
-    return namespace(points).stack([x, y], -1)
+    result: Array = namespace(points).stack([x, y], -1)
+    return result
 
 
 def to_plane(points: Array) -> tuple[Array, Array]:
@@ -74,7 +78,8 @@ def to_plane(points: Array) -> tuple[Array, Array]:
 def rays_through_plane(plane: Array) -> Array:
     """Unit rays through (x/z, y/z)."""
     xp = namespace(plane)
-    return unit(xp.concatenate([plane, xp.ones_like(plane[..., :1])], -1))
+    result: Array = unit(xp.concatenate([plane, xp.ones_like(plane[..., :1])], -1))
+    return result
 
 
 def angle_from_axis(points: Array) -> tuple[Array, Array, Array]:
@@ -91,7 +96,8 @@ def at_radius(points: Array, side: Array, rho: Array, focal: float) -> Array:
     near = side < NEAR_AXIS * z
     far = side > 1e-12 * abs(z)
     scale = xp.where(near, focal / xp.where(near, z, 1.0), rho / xp.where(far, side, 1.0))
-    return points[..., :2] * scale[..., None]
+    result: Array = points[..., :2] * scale[..., None]
+    return result
 
 
 @lru_cache(maxsize=256)

@@ -42,11 +42,13 @@ class KannalaBrandt(FocalCamera):
 
     def _radius(self, theta: Array) -> Array:
         t2 = theta * theta
-        return theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+        result: Array = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+        return result
 
     def _slope(self, theta: Array) -> Array:
         t2 = theta * theta
-        return 1 + t2 * (3 * self.k1 + t2 * (5 * self.k2 + t2 * (7 * self.k3 + t2 * 9 * self.k4)))
+        result: Array = 1 + t2 * (3 * self.k1 + t2 * (5 * self.k2 + t2 * (7 * self.k3 + t2 * 9 * self.k4)))
+        return result
 
     def _pixels(self, points: Array) -> tuple[Array, Array]:
         theta, side, exists = angle_from_axis(points)
@@ -102,7 +104,8 @@ class Scaramuzza(CameraModel):
     def _sensor(self, pixels: Array) -> Array:
         """(x', y') of pixels."""
         u, v, det = pixels[..., 0] - self.cx, pixels[..., 1] - self.cy, self.c - self.d * self.e
-        return namespace(pixels).stack([(u - self.d * v) / det, (self.c * v - self.e * u) / det], -1)
+        result: Array = namespace(pixels).stack([(u - self.d * v) / det, (self.c * v - self.e * u) / det], -1)
+        return result
 
     def _height(self, rho: Array) -> Array:
         return self.a0 + rho * (self.a1 + rho * (self.a2 + rho * (self.a3 + rho * self.a4)))

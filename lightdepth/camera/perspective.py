@@ -54,13 +54,14 @@ class Brown(FocalCamera):
         x, y = plane[..., 0], plane[..., 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + self.k2 * r2)
-        return namespace(plane).stack(
+        result: Array = namespace(plane).stack(
             [
                 x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
                 y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
             ],
             -1,
         )
+        return result
 
     def _newton(self, plane: Array, distorted: Array) -> Array:
         """One step towards distort(plane) = distorted."""
@@ -74,7 +75,8 @@ class Brown(FocalCamera):
         det = xx * yy - xy * xy
         det = xp.where(abs(det) < 1e-9, 1e-9, det)
         step = xp.stack([yy * error[..., 0] - xy * error[..., 1], xx * error[..., 1] - xy * error[..., 0]], -1)
-        return plane - step / det[..., None]
+        result: Array = plane - step / det[..., None]
+        return result
 
     def _pixels(self, points: Array) -> tuple[Array, Array]:
         xp = namespace(points)

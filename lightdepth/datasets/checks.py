@@ -214,7 +214,8 @@ def _opengl(pose: np.ndarray) -> np.ndarray:
 
 def _left_handed(pose: np.ndarray) -> np.ndarray:
     flip = np.diag([1.0, -1.0, 1.0, 1.0])
-    return flip @ pose @ flip
+    result: np.ndarray = flip @ pose @ flip
+    return result
 
 
 def _as_is(pose: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +54,7 @@ class BinaryFile:
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
 
-    def take(self, layout: str) -> tuple:
+    def take(self, layout: str) -> tuple[Any, ...]:
         size = struct.calcsize("<" + layout)
         return struct.unpack("<" + layout, self._next(size))
 

@@ -13,7 +13,8 @@ from lightdepth.errors import InputError
 
 def to_bgr8(image: np.ndarray) -> np.ndarray:
     """RGB float in [0, 1] -> BGR uint8 for cv2."""
-    return cv2.cvtColor(np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
+    result: np.ndarray = cv2.cvtColor(np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
+    return result
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -24,7 +25,8 @@ def read_image(path: Path) -> np.ndarray:
 
 def unit_range(pixels: np.ndarray) -> np.ndarray:
     """uint8 or uint16 as float32 in [0, 1]."""
-    return np.divide(pixels, np.float32(np.iinfo(pixels.dtype).max), dtype=np.float32)
+    result: np.ndarray = np.divide(pixels, np.float32(np.iinfo(pixels.dtype).max), dtype=np.float32)
+    return result
 
 
 def read_bytes(path: Path, what: str = "file") -> bytes:

@@ -23,4 +23,5 @@ def pose_from_quaternion(quaternion: np.ndarray, translation: np.ndarray, where:
 
 def quaternion_from_pose(pose: np.ndarray) -> np.ndarray:
     """Unit quaternion (w, x, y, z), w >= 0, of a pose's rotation."""
-    return Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True, scalar_first=True)
+    result: np.ndarray = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True, scalar_first=True)
+    return result

@@ -121,4 +121,5 @@ def _without_specks(found: np.ndarray, least: int) -> np.ndarray:
     joined = cv2.dilate(found, np.ones((size, size), np.uint8))
     number, labels = cv2.connectedComponents(joined)
     pixels = np.bincount(labels[found > 0], minlength=number)
-    return found * (pixels[labels] >= 3 * least)
+    result: np.ndarray = found * (pixels[labels] >= 3 * least)
+    return result

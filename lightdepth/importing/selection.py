@@ -83,4 +83,5 @@ def neighbourhood(sharpness: np.ndarray, times: np.ndarray) -> np.ndarray:
     size = int(np.clip(2 / np.median(steps), 5, 121)) | 1 if len(steps) else 15
     known = np.isfinite(sharpness)
     filled = np.interp(np.arange(len(sharpness)), np.flatnonzero(known), sharpness[known]) if known.any() else sharpness
-    return percentile_filter(filled, 75, size=min(size, 2 * len(filled) - 1), mode="nearest")
+    result: np.ndarray = percentile_filter(filled, 75, size=min(size, 2 * len(filled) - 1), mode="nearest")
+    return result

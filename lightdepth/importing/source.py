@@ -41,7 +41,8 @@ class Source:
         """So many indices spread over it, such that are quick to read."""
         if self.video is not None:
             return quick_sample(self.video, count)
-        return np.unique(np.linspace(0, len(self) - 1, count).round().astype(int)).tolist()
+        result: list[int] = np.unique(np.linspace(0, len(self) - 1, count).round().astype(int)).tolist()
+        return result
 
 
 def open_source(source: SequenceSource) -> tuple[Source, list[Path]]:

@@ -278,7 +278,8 @@ def _moments(samples: LightSamples, residual: np.ndarray, sigma: float) -> np.nd
     weight = robust_weights(residual / sigma, "tukey")
     table = np.stack([samples.log_distance, -samples.log_v, -samples.off_axis], 1)
     table = table - weight @ table / max(float(weight.sum()), 1e-9)
-    return table.T @ (weight[:, None] * table)
+    result: np.ndarray = table.T @ (weight[:, None] * table)
+    return result
 
 
 def _solved(moments: np.ndarray, gram_prior: np.ndarray, pull: np.ndarray) -> tuple[float, float]:

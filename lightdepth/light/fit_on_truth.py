@@ -53,7 +53,8 @@ class _Pixels:
         light = PhotometricCalibration(mu=mu, reflectance=rho).terms()
         distance = torch.where(self.batch.true_valid, self.batch.true_distance, 1.0)
         found = indirect_irradiance(distance, self.batch.rays, self.batch.true_valid, light)
-        return found.flatten().numpy()[self.place].astype(float)
+        result: np.ndarray = found.flatten().numpy()[self.place].astype(float)
+        return result
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,8 @@ def _pixels_of(
     place = np.sort(rng.choice(place, min(most, len(place)), replace=False))
 
     def at(values: torch.Tensor) -> np.ndarray:
-        return values.flatten().numpy()[place].astype(float)
+        result: np.ndarray = values.flatten().numpy()[place].astype(float)
+        return result
 
     return _Pixels(batch, place, at(log_v), at(log_distance), np.log(at(cosine)), 1 - at(batch.rays[:, 2:]))
 

@@ -114,7 +114,8 @@ def _unhidden(pixels: np.ndarray, distance: np.ndarray, valid: np.ndarray, camer
     cell = row * (_CELLS + 1) + column
     nearest = np.full((_CELLS + 1) ** 2, np.inf)
     np.minimum.at(nearest, cell[valid], distance[valid])
-    return valid & (distance <= _HIDDEN * nearest[cell])
+    result: np.ndarray = valid & (distance <= _HIDDEN * nearest[cell])
+    return result
 
 
 def _each(change: Callable[[Keyframe], Keyframe]) -> Callable[[Submap], Submap]:

@@ -100,4 +100,5 @@ class UncertaintyHead(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         raw = self.layers(features.detach()).float().clamp(-_LOG_SIGMA_LIMIT, _LOG_SIGMA_LIMIT)
-        return self.calibration[0] * raw + self.calibration[1]
+        result: Tensor = self.calibration[0] * raw + self.calibration[1]
+        return result

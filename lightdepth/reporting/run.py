@@ -154,7 +154,8 @@ def git_revision() -> str | None:
         changed = subprocess.run(["git", "status", "--porcelain", "-uno"], **call).stdout.strip()  # type: ignore[call-overload]
     except (OSError, subprocess.SubprocessError):
         return None
-    return revision + ("+" if changed else "")
+    result: str | None = revision + ("+" if changed else "")
+    return result
 
 
 def input_hash(path: Path) -> str:

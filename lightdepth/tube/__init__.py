@@ -2,8 +2,11 @@
 
 from lightdepth.tube.film import FilmConfig
 from lightdepth.tube.path import Lens, PathConfig, any_field, camera_path, lens, octagon
-from lightdepth.tube.scene import SensorConfig, ShapeConfig, TextureConfig, Tube, TubeConfig, cavity, realistic
+from lightdepth.tube.scene import Tube, TubeConfig, cavity, realistic
+from lightdepth.tube.sensor import SensorConfig
 from lightdepth.tube.sequence import TubeSequence, render_sequence, tube_frames
+from lightdepth.tube.shape import ShapeConfig
+from lightdepth.tube.texture import TextureConfig
 
 __all__ = [
     "FilmConfig",

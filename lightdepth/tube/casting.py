@@ -67,7 +67,8 @@ class EmbreeCaster:
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Exact distance (n,) from points (n, 3) to the mesh."""
-        return self._scene.compute_distance(self._tensor(points)).numpy()
+        result: np.ndarray = self._scene.compute_distance(self._tensor(points)).numpy()
+        return result
 
     def _tensor(self, array: np.ndarray) -> Any:
         """Open3D's, of float32."""

@@ -57,7 +57,8 @@ def fine_relief(rng: np.random.Generator, size: int = 512) -> np.ndarray:
     """Slopes (size, size, 2) float32 of unit deviation, a tile that repeats."""
     height = gaussian_filter(rng.standard_normal((size, size)).astype(np.float32), 0.8, mode="wrap")
     slopes = np.stack([np.roll(height, -1, axis) - height for axis in (0, 1)], -1)
-    return slopes / slopes.std()
+    result: np.ndarray = slopes / slopes.std()
+    return result
 
 
 def _mucus(

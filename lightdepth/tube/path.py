@@ -52,7 +52,8 @@ def octagon(camera: CameraModel, cut: float = 0.2) -> np.ndarray:
     """(H, W) bool: the image without its corners, cut at `cut` of the height; endoscopes mask them."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     from_corner = np.minimum(u, camera.width - u) + np.minimum(v, camera.height - v)
-    return from_corner > cut * camera.height
+    result: np.ndarray = from_corner > cut * camera.height
+    return result
 
 
 def any_field(camera: CameraModel, rng: np.random.Generator) -> np.ndarray:
@@ -61,7 +62,8 @@ def any_field(camera: CameraModel, rng: np.random.Generator) -> np.ndarray:
         return octagon(camera, rng.uniform(0.05, 0.35))
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     x, y = (np.array([camera.width, camera.height]) / 2) * rng.uniform(0.94, 1.06, 2)
-    return np.hypot(u - x, v - y) < rng.uniform(0.4, 0.65) * camera.height
+    result: np.ndarray = np.hypot(u - x, v - y) < rng.uniform(0.4, 0.65) * camera.height
+    return result
 
 
 def camera_path(

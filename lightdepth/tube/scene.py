@@ -210,7 +210,7 @@ class Tube:
         def image(values: Tensor) -> Tensor:
             """(B, C, P) -> (B, C, H, W), 0 where no wall was met."""
             whole = values.new_zeros((*values.shape[:2], mask.size))
-            return whole.index_copy_(2, inside, values * met[:, None]).unflatten(-1, mask.shape)
+            return whole.index_copy_(2, inside, values * met[:, None]).view(*values.shape[:2], *mask.shape)
 
         inside = torch.as_tensor(np.flatnonzero(wanted), device=self.device)
         distance = image(t[:, None])[:, 0]

@@ -80,7 +80,8 @@ class TubeShape:
 def smooth_noise(shape: tuple[int, int], sigma: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
     """Noise of unit deviation over (s, phi), smooth over sigma cells, periodic in phi."""
     noise = gaussian_filter(rng.standard_normal(shape), sigma, mode=("nearest", "wrap"))
-    return noise / max(noise.std(), 1e-12)
+    result: np.ndarray = noise / max(noise.std(), 1e-12)
+    return result
 
 
 def make_shape(config: ShapeConfig, rng: np.random.Generator) -> TubeShape:
@@ -128,7 +129,8 @@ def closed(relative: np.ndarray, end: float, s: np.ndarray, length: float) -> np
     """Radii (R, C) at s (R,) that close at `length`, or at the last ring, with a half ellipse, `end` mm long."""
     length = min(length, float(s[-1]))
     closing = np.sqrt(np.clip(1 - ((s - (length - end)) / end).clip(min=0) ** 2, 0, 1))
-    return relative * np.maximum(closing, 1e-3)[:, None]
+    result: np.ndarray = relative * np.maximum(closing, 1e-3)[:, None]
+    return result
 
 
 def _normals(vertices: np.ndarray, side: np.ndarray) -> np.ndarray:
@@ -138,7 +140,8 @@ def _normals(vertices: np.ndarray, side: np.ndarray) -> np.ndarray:
     along_phi = (wrapped[:, 2:] - wrapped[:, :-2]) / 2
     normals = np.cross(along_s, along_phi)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-12)
-    return normals * np.sign((normals * -side).sum(-1).mean())
+    result: np.ndarray = normals * np.sign((normals * -side).sum(-1).mean())
+    return result
 
 
 def _wandering(s: np.ndarray, swing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -193,7 +196,8 @@ def _folds(
 def _by_third(weights: np.ndarray, phi: np.ndarray) -> np.ndarray:
     """One of three weights around each of the angles 0, 120 and 240 degrees, blended between them."""
     near = np.exp(4 * np.cos(phi[:, None] - np.arange(3) * 2 * np.pi / 3))
-    return near @ weights / near.sum(1)
+    result: np.ndarray = near @ weights / near.sum(1)
+    return result
 
 
 def _waves(phi: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -136,12 +136,14 @@ def _new_points(frame: Frame, count: int, rng: np.random.Generator) -> np.ndarra
     column, row = pixels.astype(int).T
     rays, valid = frame.camera.unproject(np.stack([column, row], -1) + 0.5)
     points = rays * truth[row, column, None]
-    return (points @ pose[:3, :3].T + pose[:3, 3])[valid]
+    result: np.ndarray = (points @ pose[:3, :3].T + pose[:3, 3])[valid]
+    return result
 
 
 def _project(frame: Frame, world: np.ndarray) -> np.ndarray:
     pose = _pose(frame)
-    return frame.camera.project((world - pose[:3, 3]) @ pose[:3, :3])[0]
+    result: np.ndarray = frame.camera.project((world - pose[:3, 3]) @ pose[:3, :3])[0]
+    return result
 
 
 def _sees(frame: Frame, world: np.ndarray) -> np.ndarray:
@@ -153,4 +155,5 @@ def _sees(frame: Frame, world: np.ndarray) -> np.ndarray:
     column = np.clip(pixels[:, 0].astype(int), 0, frame.camera.width - 1)
     row = np.clip(pixels[:, 1].astype(int), 0, frame.camera.height - 1)
     at_wall = np.abs(truth[row, column] / np.linalg.norm(in_cam, axis=1).clip(min=1e-9) - 1) < 0.03
-    return valid & frame.valid[row, column] & at_wall
+    result: np.ndarray = valid & frame.valid[row, column] & at_wall
+    return result

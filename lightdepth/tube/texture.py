@@ -105,4 +105,5 @@ def _vessels(shape: tuple[int, int], count: int, config: TextureConfig, rng: np.
             shifted = np.rint((points + (shift, 0)) * 16).astype(np.int32)
             strength = float(0.4 + 0.6 * width / 0.7)
             cv2.polylines(canvas, [shifted], False, strength, thickness, cv2.LINE_AA, shift=4)
-    return gaussian_filter(canvas, 1.0, mode=("nearest", "wrap")).clip(0, 1)
+    result: np.ndarray = gaussian_filter(canvas, 1.0, mode=("nearest", "wrap")).clip(0, 1)
+    return result

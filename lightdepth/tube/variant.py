@@ -128,7 +128,8 @@ class VariantTube(Tube):
         shade = gaussian_filter1d(gaussian_filter1d(shade.reshape(rows, columns), 4, axis=0), 4, axis=1, mode="wrap")
         colour = np.array([1.0, rng.uniform(0.3, 0.7), rng.uniform(0.2, 0.55)])
         tone = np.exp(0.12 * shade[..., None] * (0.3, 1, 1) - rng.uniform(0.1, 0.5) * net.reshape(rows, columns, 1))
-        return (colour * tone).clip(0.02, 1).astype(np.float32)
+        result: np.ndarray = (colour * tone).clip(0.02, 1).astype(np.float32)
+        return result
 
     @staticmethod
     def _expose(
@@ -156,4 +157,5 @@ def _section(phi: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     radius = rng.uniform(0.82, 1.15, knots)
     start = at[0]
     spline = CubicSpline(np.append(at, start + 2 * np.pi), np.append(radius, radius[0]), bc_type="periodic")
-    return spline((phi - start) % (2 * np.pi) + start)
+    result: np.ndarray = spline((phi - start) % (2 * np.pi) + start)
+    return result
