@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from densify.aligned import AlignedKeyframe
 from densify.coverage import seen_well
 from densify.dense_map import DenseMap
+from densify.evaluation.records import MapFigures
 from densify.joining import Merged, joined_name
 from densify.pipeline import SubmapResult
 from densify.predictions import Seen
@@ -70,16 +71,16 @@ def densify_page(
     baselines: Sequence[SubmapResult],
     gallery: Gallery,
     notes: Sequence[str],
-    evaluation: Mapping[str, Any] | None = None,
+    figures: Sequence[MapFigures] | None = None,
     mm_per_unit: float | None = None,
 ) -> Report:
-    """The whole page. `baselines` are the same maps densified with a constant distance, or nothing; areas are in mm²
-    where the unit of the maps is known."""
+    """The whole page. `baselines` are the same maps densified with a constant distance, or nothing; `figures` their
+    errors where there is truth; areas are in mm² where the unit of the maps is known."""
     page = Report(title)
     for note in notes:
         page.text(note)
-    if evaluation is not None:
-        _errors(page, evaluation)
+    if figures is not None:
+        _errors(page, figures)
     page.heading("Surfaces")
     rows = []
     for result in results:
@@ -124,28 +125,28 @@ def joined_section(page: Report, merged: Merged) -> None:
             page.figures(mesh_pictures(result.dense, f"maps {maps}"))
 
 
-def _errors(page: Report, evaluation: Mapping[str, Any]) -> None:
+def _errors(page: Report, figures: Sequence[MapFigures]) -> None:
     page.heading("Errors against the truth")
     page.text(
         "Accuracy: distance from each model point to the closest true point, after the Sim(3) that aligns the "
         "trajectories. mm."
     )
     rows = []
-    for entry in evaluation["maps"]:
-        if "error" in entry:
-            page.text(f"Map {entry['map']} could not be evaluated: {entry['error']}")
+    for entry in figures:
+        if entry.aligned is None:
+            page.text(f"Map {entry.map_id} could not be evaluated: {entry.error}")
             continue
-        if "surface_error" in entry:
-            page.text(f"Map {entry['map']}: {entry['surface_error']}")
+        if entry.surface_error:
+            page.text(f"Map {entry.map_id}: {entry.surface_error}")
         for key, name in (
             ("sparse", "sparse map"),
             ("sparse_inliers", "sparse, inliers only"),
             ("dense", "dense surface"),
         ):
-            found = entry.get(key)
-            if found:
-                where = f"map {entry['map']} (ATE {number(entry['rms_ate_mm'])} mm)"
-                rows.append([where, name, found["points"], found["rms_mm"], found["median_mm"]])
+            found = entry.clouds.get(key)
+            if found is not None:
+                where = f"map {entry.map_id} (ATE {number(entry.aligned.rms_ate_mm)} mm)"
+                rows.append([where, name, found.points, found.rms_mm, found.median_mm])
     page.table(["", "model", "points", "RMS", "median"], rows)
 
 

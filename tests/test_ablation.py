@@ -11,6 +11,7 @@ import pytest
 import torch
 from scenes import cylinder
 
+import train.ablation.judge as judging
 import train.ablation.run as ablation
 from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import save_model
@@ -20,10 +21,12 @@ from lightdepth.frame import to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
-from train.ablation.run import JudgedColons, Row, ablate
+from train.ablation.plan import plans_of
+from train.ablation.rows import JudgedColons, Row
 from train.ablation.table import METRICS, Result, Table, clear, lines, markdown, write_table
 from train.cli import training_parser
 from train.colons import TubeData, with_reflectance
+from train.commands.ablate import ablate
 from train.datamodule import FrameData, FrameDataModule
 
 ROOT = Path(__file__).parents[1]
@@ -68,8 +71,8 @@ def cheap(monkeypatch):
         return [to_batch(frame, size) for _ in range(tube.frames)]
 
     monkeypatch.setattr("train.datamodule.tube_scene", scene)
-    monkeypatch.setattr("train.ablation.run.tube_scene", scene)
-    monkeypatch.setattr(ablation, "variant_frames", lambda *_: [cylinder(CAMERA).frame()])
+    monkeypatch.setattr("train.ablation.judge.tube_scene", scene)
+    monkeypatch.setattr(judging, "variant_frames", lambda *_: [cylinder(CAMERA).frame()])
     monkeypatch.setattr(ablation, "fit", untrained)
 
 
@@ -196,7 +199,7 @@ def test_every_shipped_ablation_has_rows_that_train_takes(path, tmp_path, monkey
     parser = training_parser()
     parser.exit_on_error = False
     names = ("base", "settings", "rows", "judged", "seeds")
-    plans = ablation._plans(parser, tmp_path, *(given[name] if name != "seeds" else (11,) for name in names))
+    plans = plans_of(parser, tmp_path, *(given[name] if name != "seeds" else (11,) for name in names))
     assert len(plans) == len(given["rows"]) > 20 and len(given["seeds"]) >= 3
     assert {c.make for c in given["judged"]} == {"realistic", "variant"}
     assert {c.strength for c in given["judged"]} == {"weak", "strong"}
@@ -282,7 +285,7 @@ def test_the_reflectance_that_a_network_is_told_is_a_wrong_one_or_the_one_of_lea
             distance = right if self.told[-1] == 0.4 else right.mean().expand_as(right)
             return distance.expand(len(image), -1, -1, -1), image[:, :2]
 
-    judge = ablation.Judge((JudgedColons("c", "plain", "weak", 4, 1),), TubeData(frames=1), (40, 32))
+    judge = judging.Judge((JudgedColons("c", "plain", "weak", 4, 1),), TubeData(frames=1), (40, 32))
     loss, found = LossConfig(reflectance=0.0, cosine_exponent=1.0, smoothness=0.0, facing=0.0, chroma=0.0), {}
     for told in ("true", "wrong", "estimated"):
         network = Spy()
@@ -299,9 +302,9 @@ def test_far_depth_and_the_rim_of_a_wide_lens_are_not_judged():
     rays = torch.cat([colon.rays[:, :2], z], 1)
     seen = colon._replace(rays=rays, true_distance=torch.where(far, 300.0, right))
     wrong = torch.where(far | (z < 0.15), 7 * right, right)
-    assert ablation._errors([wrong], [seen])["rmse_mm"] == pytest.approx(0, abs=1e-4)
+    assert judging._errors([wrong], [seen])["rmse_mm"] == pytest.approx(0, abs=1e-4)
     inside = torch.where(torch.arange(40) == 20, 7 * right, right)
-    assert ablation._errors([inside], [seen])["rmse_mm"] > 1
+    assert judging._errors([inside], [seen])["rmse_mm"] > 1
 
 
 def test_reflectance_goes_into_the_network_that_asks_for_it_and_into_no_other():

@@ -17,9 +17,10 @@ from lightdepth.maps import write_multimap
 from lightdepth.models import NetworkModel
 from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
-from train.adapting.module import Adaptation, anchor_loss, let_learn, merge, source_colons, target_loss
+from train.adapting.card import source_colons, target_loss
+from train.adapting.judging import Judgement, Verdict, verdict
+from train.adapting.module import Adaptation, anchor_loss, let_learn, merge
 from train.colons import TubeData
-from train.commands.adapt import Judgement, Verdict, verdict
 from train.commands.adapt import adapt as adapt_verb
 from train.datamodule import FrameData, FrameDataModule, collate
 
@@ -148,7 +149,7 @@ def test_the_light_that_the_map_told_is_what_training_sees(start, sequences, tmp
         return original(self, batch)
 
     found = PhotometricCalibration(gamma=1.3, mu=0.7, source="measured")
-    monkeypatch.setattr("train.commands.adapt.fit_assumed_light", lambda *_: found)
+    monkeypatch.setattr("train.adapting.target.fit_assumed_light", lambda *_: found)
     monkeypatch.setattr(Adaptation, "batch_loss", spy)
     adapted(start, sequences / "unlit", tmp_path / "run", map=sequences / "slam", keep_worse=True, steps=2)
     assert len(seen) == 2 and np.allclose(seen, 1.3)

@@ -18,9 +18,12 @@ from verbs import by_options
 
 from densify.commands.evaluate import evaluate as evaluate_verb
 from densify.config import DensifyConfig
-from densify.evaluation.judge import Model, dense_models, judge_depth, judge_maps, read_run, read_truth
+from densify.evaluation.judge import judge_maps
+from densify.evaluation.judge_depth import judge_depth
+from densify.evaluation.judged_map import JudgedMap, dense_models, read_run
 from densify.evaluation.suite import alone
 from densify.evaluation.tables import Table, depth_table, long_rows, surface_table, trajectory_table, write_evaluations
+from densify.evaluation.truth import read_truth
 from densify.pipeline import densify
 from lightdepth.datasets import write_folder
 from lightdepth.errors import InputError
@@ -198,10 +201,10 @@ def test_the_order_of_the_frames_does_not_matter(run, predictions):
     mixed = random.Random(0).sample(list(FRAMES), len(FRAMES))
     assert [f.name for f in mixed] != [f.name for f in FRAMES]
     depth = [judge_depth(predictions, sequence(list(f))) for f in (FRAMES, mixed)]
-    assert json.dumps(depth[0].result) == json.dumps(depth[1].result)
+    assert json.dumps(depth[0].as_dict()) == json.dumps(depth[1].as_dict())
     models = [replace(m, clouds={"dense": m.clouds["dense"]}) for m in dense_models(read_run(run))]
     maps = [judge_maps(models, read_truth(sequence(list(f)))) for f in (FRAMES, mixed)]
-    assert json.dumps(maps[0].result) == json.dumps(maps[1].result)
+    assert json.dumps(maps[0].as_dict()) == json.dumps(maps[1].as_dict())
     for one, other in (depth, maps):
         assert {k: v.tolist() for k, v in one.curves.items()} == {k: v.tolist() for k, v in other.curves.items()}
 
@@ -223,19 +226,17 @@ def test_predictions_have_nine_errors_under_four_alignments(predictions, data, t
     assert "| none (up to scale) | seq |" in text and "4 of 4 predicted frames judged (the sequence has 10)" in text
 
 
-def test_several_sequences_are_averaged_over_frames_and_over_sequences(predictions, judged):
-    one = judge_depth(predictions, sequence(list(FRAMES))).result
-    other = {**one, "frames_judged": 12, "mean": {k: 3 * v for k, v in one["mean"].items()}}
+def test_several_sequences_are_averaged_over_frames_and_over_sequences(predictions, run):
+    one = judge_depth(predictions, sequence(list(FRAMES))).judged
+    thrice = replace(one.mean, errors={k: 3 * v for k, v in one.mean.errors.items()})
+    other = replace(one, mean=thrice, frames={f"{n} {i}": f for n, f in one.frames.items() for i in range(3)})
     rows = {tuple(r[:2]): r[2] for r in depth_table({"a": one, "b": other}).rows}
-    value = one["mean"]["abs_rel_median"]
+    value = one.mean.errors["abs_rel_median"]
     assert rows["median", "mean over sequences"] == pytest.approx(2 * value)
     assert rows["median", "mean over frames"] == pytest.approx(value * (4 + 3 * 12) / 16)
-    found = metrics(judged)
-    without = {
-        **found,
-        "all": {},
-        "trajectory": {**found["trajectory"], "rms_ate_mm": 3 + found["trajectory"]["rms_ate_mm"]},
-    }
+    found = judge_maps(dense_models(read_run(run)), read_truth(sequence(FRAMES))).judged
+    farther = replace(found.trajectory, rms_ate_mm=3 + found.trajectory.rms_ate_mm)
+    without = replace(found, pooled={}, trajectory=farther)
     rows = {r[0]: r[1:] for r in trajectory_table({"a": found, "b": without}).rows}
     a, b, mean = rows["RMS ATE mm, Sim(3)"]
     assert mean == pytest.approx((a + b) / 2) and rows["# Frames"] == [10, 10, 10]
@@ -252,7 +253,7 @@ def test_several_sequences_are_written_side_by_side(predictions, tmp_path):
     write_evaluations({"a": one, "b": one}, tmp_path)
     assert set(metrics(tmp_path)["sequences"]) == {"a", "b"}
     assert {"a_cumulative_error.png", "b_cumulative_error.png"} <= {p.name for p in tmp_path.iterdir()}
-    assert {row[0] for row in long_rows({"a": one.result, "b": one.result})[1:]} == {"a", "b"}
+    assert {row[0] for row in long_rows({"a": one.judged, "b": one.judged})[1:]} == {"a", "b"}
 
 
 def test_a_map_and_a_trajectory_are_judged_too(data, tmp_path):
@@ -345,9 +346,9 @@ def test_truth_that_does_not_fit_is_refused_and_nothing_is_written(run, predicti
     for source, where, message in cases:
         with pytest.raises(InputError, match=message):
             evaluate(source, tmp_path / where, tmp_path / "out")
-    models = [Model(m.trajectory) for m in dense_models(read_run(run))]
+    models = [JudgedMap(m.trajectory) for m in dense_models(read_run(run))]
     found = judge_maps(models, read_truth(sequence(list(FRAMES[:7])), with_surface=False), common=True)
-    assert [m["poses"] for m in found.result["maps"]] == [5, 4]
+    assert [m.aligned.poses for m in found.judged.maps] == [5, 4]
     assert not (tmp_path / "out").exists()
 
 

@@ -16,7 +16,10 @@ from scipy.spatial.transform import Rotation
 from densify.config import DensifyConfig
 from densify.dense_map import DenseMapFiles
 from densify.evaluation.errors import evaluate_depth, rms_ate, surface_gap, true_cloud
-from densify.evaluation.judge import dense_models, judge_depth, judge_gap, judge_maps, read_run, read_truth
+from densify.evaluation.judge import judge_gap, judge_maps
+from densify.evaluation.judge_depth import judge_depth
+from densify.evaluation.judged_map import dense_models, read_run
+from densify.evaluation.truth import read_truth
 from densify.pipeline import densify
 from densify.similarity import Similarity, fit_similarity
 from lightdepth.camera import Pinhole
@@ -182,26 +185,27 @@ def world():
 
 
 def test_maps_made_with_true_depth_are_judged_as_true(run, world):
-    judged = judge_maps(dense_models(read_run(run)), world).result
-    assert judged["kind"] == "surface" and [m["map"] for m in judged["maps"]] == [0, 1]
-    for row in judged["maps"]:
-        assert row["rms_ate_mm"] < 0.3
+    judged = judge_maps(dense_models(read_run(run)), world).judged
+    assert [m.map_id for m in judged.maps] == [0, 1]
+    for found in judged.maps:
+        assert found.aligned.rms_ate_mm < 0.3
+        dense, sparse, inliers = (found.clouds[name] for name in ("dense", "sparse", "sparse_inliers"))
         # Not zero: the true cloud is every second pixel of small images, a millimetre apart.
-        assert row["dense"]["median_mm"] < 1.2 and row["dense"]["rms_mm"] < 3
-        assert row["dense"]["to_mesh"]["median_mm"] < row["dense"]["median_mm"]
-        assert row["sparse"]["rms_mm"] > 5 * row["sparse_inliers"]["rms_mm"]
-        assert row["sparse_inliers"]["points"] < row["sparse"]["points"]
-    whole = judged["all"]["dense"]
-    assert whole["points"] == sum(m["dense"]["points"] for m in judged["maps"])
-    assert whole["completeness"]["median_mm"] < min(m["dense"]["completeness"]["median_mm"] for m in judged["maps"])
-    assert whole["f_score"]["5mm"] > 0.9 > whole["f_score"]["1mm"]
+        assert dense.median_mm < 1.2 and dense.rms_mm < 3
+        assert dense.to_mesh.median_mm < dense.median_mm
+        assert sparse.rms_mm > 5 * inliers.rms_mm
+        assert inliers.points < sparse.points
+    whole, parts = judged.pooled["dense"], [m.clouds["dense"] for m in judged.maps]
+    assert whole.points == sum(part.points for part in parts)
+    assert whole.completeness.median_mm < min(part.completeness.median_mm for part in parts)
+    assert whole.f_score["5mm"] > 0.9 > whole.f_score["1mm"]
 
 
 def test_a_map_that_cannot_be_judged_says_why_and_the_others_are(run, world):
     first, second = dense_models(read_run(run))
     t = first.trajectory
     alone = replace(first, trajectory=replace(t, numbers=t.numbers[:2], centers=t.centers[:2], keyframe=t.keyframe[:2]))
-    judged = judge_maps([alone, second], world).result
+    judged = judge_maps([alone, second], world).as_dict()
     expected = {"map": 0, "keyframes": 2, "error": "2 common poses; a similarity needs at least 3"}
     assert judged["maps"][0] == expected and "dense" in judged["maps"][1]
     stranger = replace(first, trajectory=replace(t, numbers=t.numbers + 500))
@@ -225,9 +229,9 @@ def join(path: Path, **changes) -> Path:
 def test_the_gap_is_read_from_a_file_with_either_rotation(tmp_path):
     maps = [ball(10.0), ball(11.0, KNOWN, 1)]
     expected = judge_gap(maps, join(tmp_path / "a.json"))
-    assert expected["median"] == pytest.approx(0.1, abs=2e-3) and (expected["first"], expected["second"]) == (0, 1)
+    assert expected.gap.median == pytest.approx(0.1, abs=2e-3) and (expected.first, expected.second) == (0, 1)
     as_matrix = judge_gap(maps, join(tmp_path / "b.json", rotation=KNOWN.rotation.tolist()))
-    assert as_matrix["median"] == pytest.approx(expected["median"], rel=1e-6)
+    assert as_matrix.gap.median == pytest.approx(expected.gap.median, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -258,13 +262,11 @@ def test_predictions_are_judged_frame_by_frame_and_frames_without_truth_are_skip
     frames = list(colon(0).frames[:3])
     folder = predictions(tmp_path / "p", frames, scale=0.1)
     frames[1] = replace(frames[1], true_distance=None)
-    judged = judge_depth(folder, sequence(frames)).result
-    assert list(judged["frames"]) == ["000000", "000002"]
-    assert judged["skipped"] == {"000001": "000001: no true depth"}
-    assert judged["mean"]["abs_rel_median"] < 1e-6 < 0.5 < judged["mean"]["abs_rel_none"]
-    assert (
-        judged["frames_judged"] == 2 and judged["frames_predicted"] == 3 and judged["predicted_unit"] == "up to scale"
-    )
+    judged = judge_depth(folder, sequence(frames)).judged
+    assert list(judged.frames) == ["000000", "000002"]
+    assert judged.skipped == {"000001": "000001: no true depth"}
+    assert judged.mean.errors["abs_rel_median"] < 1e-6 < 0.5 < judged.mean.errors["abs_rel_none"]
+    assert judged.frames_judged == 2 and judged.frames_predicted == 3 and judged.predicted_unit == "up to scale"
 
 
 def test_predictions_without_a_true_frame_are_refused(tmp_path):
@@ -273,7 +275,7 @@ def test_predictions_without_a_true_frame_are_refused(tmp_path):
         judge_depth(folder, sequence(colon(0).frames[4:]))
     with pytest.raises(InputError, match=r"1 match \(frame 2\), 2 do not \(0, 1\)\. Give the truth .* or --common"):
         judge_depth(folder, sequence(colon(0).frames[2:]))
-    assert list(judge_depth(folder, sequence(colon(0).frames[2:]), common=True).result["frames"]) == ["000002"]
+    assert list(judge_depth(folder, sequence(colon(0).frames[2:]), common=True).judged.frames) == ["000002"]
     with pytest.raises(InputError, match="no frame has valid true depth; the first: 000000: no true depth"):
         judge_depth(folder, sequence([replace(f, true_distance=None) for f in colon(0).frames]))
 

@@ -18,7 +18,8 @@ import pytest
 from densify.agreement import AgreementConfig
 from densify.config import DensifyConfig
 from densify.evaluation.errors import evaluate_depth
-from densify.evaluation.judge import judge_gap, read_run
+from densify.evaluation.judge import judge_gap
+from densify.evaluation.judged_map import read_run
 from densify.inputs import fitted_to_frames
 from densify.pipeline import SubmapResult, densify
 from lightdepth.datasets import FrameSequence, open_sequence, read_c3vd
@@ -89,10 +90,10 @@ def test_two_submaps_of_the_sinus_stay_apart_and_fit_together_by_their_known_sim
     join = {"first": 0, "second": 1, "scale": 0.37, "translation": [1.5, -0.7, 2.0]}
     join["rotation"] = (0.9 * np.array([0.6, 0, 0.8])).tolist()
     (tmp_path / "join.json").write_text(json.dumps(join))
-    gap = judge_gap(maps, tmp_path / "join.json")
-    assert gap["median"] < 0.02 and gap["both_share"] > 0.8  # seen: 0.5 %, 91 %
+    gap = judge_gap(maps, tmp_path / "join.json").gap
+    assert gap.median < 0.02 and gap.both_share > 0.8  # seen: 0.5 %, 91 %
     (tmp_path / "join.json").write_text(json.dumps({**join, "scale": 0.37 * 1.2}))
-    assert judge_gap(maps, tmp_path / "join.json")["median"] > 2 * gap["median"]
+    assert judge_gap(maps, tmp_path / "join.json").gap.median > 2 * gap.median
 
 
 def test_a_real_c3vd_trajectory_is_read_the_same_from_either_order(realdata, tmp_path):

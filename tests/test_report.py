@@ -13,6 +13,7 @@ import pytest
 from colons import colon, sequence, slam, truth
 
 from densify.config import DensifyConfig
+from densify.evaluation.records import AlignedFigures, DistanceFigures, MapFigures, SurfaceFigures
 from densify.page import Gallery, densify_page
 from densify.pipeline import densify
 from lightdepth.models import ConstantModel
@@ -107,13 +108,11 @@ def test_the_report_names_keyframes_that_were_left_out_and_maps_that_could_not_b
     (result,), _, gallery = made
     failed = replace(result.dense.alignments[1], reason="sigma is 50% of the median distance")
     dense = replace(result.dense, alignments=(result.dense.alignments[0], failed, *result.dense.alignments[2:]))
-    evaluation = {
-        "maps": [
-            {"map": 0, "rms_ate_mm": 0.12, "dense": {"points": 9, "rms_mm": 1.5, "median_mm": 0.7}, "sparse": None},
-            {"map": 1, "error": "2 common poses"},
-        ]
-    }
-    page = densify_page("Maps", [replace(result, dense=dense, withheld=None)], [], gallery, [], evaluation)
+    distances = DistanceFigures(1.5, 0.7, 3.0)
+    cloud = SurfaceFigures(9, 1.5, 0.7, 3.0, None, distances, {}, {}, {})
+    first = MapFigures(0, 4, aligned=AlignedFigures(4, 0.12, None, 1.0, 1.0), clouds={"dense": cloud, "sparse": None})
+    judged = [first, MapFigures(1, 2, "2 common poses")]
+    page = densify_page("Maps", [replace(result, dense=dense, withheld=None)], [], gallery, [], judged)
     page.write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     assert "000001.png left out: sigma is 50% of the median distance" in text and "3 of 4" in text

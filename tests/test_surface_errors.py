@@ -22,8 +22,10 @@ from densify.evaluation.errors import (
     thinned,
     true_cloud,
 )
-from densify.evaluation.judge import Model, Truth, judge_maps, read_mesh, read_truth
+from densify.evaluation.judge import judge_maps
+from densify.evaluation.judged_map import JudgedMap
 from densify.evaluation.trajectory import in_order
+from densify.evaluation.truth import Truth, read_mesh, read_truth
 from densify.similarity import Similarity
 from lightdepth.errors import InputError
 
@@ -48,15 +50,15 @@ def test_distances_agree_with_trying_every_pair(seed):
     np.testing.assert_allclose(found.accuracy, pairs.min(1), atol=1e-9)
     np.testing.assert_allclose(found.completeness, pairs.min(0), atol=1e-9)
     summary = found.summary(THRESHOLDS)
-    assert summary["points"] == 70 and summary["to_mesh"] is None
-    assert summary["rms_mm"] == pytest.approx(np.sqrt((pairs.min(1) ** 2).mean()), abs=1e-9)
-    assert summary["median_mm"] == pytest.approx(sorted(pairs.min(1))[34] / 2 + sorted(pairs.min(1))[35] / 2, abs=1e-9)
+    assert summary.points == 70 and summary.to_mesh is None
+    assert summary.rms_mm == pytest.approx(np.sqrt((pairs.min(1) ** 2).mean()), abs=1e-9)
+    assert summary.median_mm == pytest.approx(sorted(pairs.min(1))[34] / 2 + sorted(pairs.min(1))[35] / 2, abs=1e-9)
     for t in THRESHOLDS:
         p = sum(d <= t for d in pairs.min(1)) / 70
         r = sum(d <= t for d in pairs.min(0)) / 130
         key = f"{t:g}mm"
-        assert (summary["precision"][key], summary["recall"][key]) == pytest.approx((p, r), abs=1e-12)
-        assert summary["f_score"][key] == pytest.approx(2 * p * r / (p + r) if p + r else 0, abs=1e-12)
+        assert (summary.precision[key], summary.recall[key]) == pytest.approx((p, r), abs=1e-12)
+        assert summary.f_score[key] == pytest.approx(2 * p * r / (p + r) if p + r else 0, abs=1e-12)
 
 
 def test_distances_agree_with_open3d():
@@ -97,10 +99,10 @@ def test_a_grid_held_over_a_plane_by_hand():
     grid = np.stack(np.meshgrid(np.arange(21.0), np.arange(21.0), [0.0]), -1).reshape(-1, 3)
     half = grid[grid[:, 0] < 10.5] + (0, 0, 0.75)
     found = surface_errors(half, truth_of(grid)).summary((0.5, 1.0))
-    assert found["rms_mm"] == found["median_mm"] == found["p90_mm"] == pytest.approx(0.75)
-    assert found["precision"] == {"0.5mm": 0, "1mm": 1} and found["f_score"]["0.5mm"] == 0
-    assert found["recall"]["1mm"] == pytest.approx(11 / 21)
-    assert found["f_score"]["1mm"] == pytest.approx(2 * (11 / 21) / (1 + 11 / 21))
+    assert found.rms_mm == found.median_mm == found.p90_mm == pytest.approx(0.75)
+    assert found.precision == {"0.5mm": 0, "1mm": 1} and found.f_score["0.5mm"] == 0
+    assert found.recall["1mm"] == pytest.approx(11 / 21)
+    assert found.f_score["1mm"] == pytest.approx(2 * (11 / 21) / (1 + 11 / 21))
 
 
 def test_models_together_are_as_accurate_as_all_their_points_and_as_complete_as_the_best():
@@ -164,7 +166,7 @@ def world() -> Truth:
     return read_truth(sequence(colon(0).frames))
 
 
-def model(seed: int, map_from_world: Similarity, order: np.ndarray | None = None) -> Model:
+def model(seed: int, map_from_world: Similarity, order: np.ndarray | None = None) -> JudgedMap:
     """A map whose points are the wall's with noise, in a frame of reference of its own."""
     rng = np.random.default_rng(seed)
     frames = colon(0).frames
@@ -173,7 +175,7 @@ def model(seed: int, map_from_world: Similarity, order: np.ndarray | None = None
     centers = np.stack([f.true_world_from_cam[:3, 3] for f in frames]) + 0.05 * rng.normal(size=(10, 3))
     points = points if order is None else points[order]
     trajectory = in_order(0, list(range(10)), map_from_world.apply(centers))
-    return Model(trajectory, {"sparse": map_from_world.apply(points)})
+    return JudgedMap(trajectory, {"sparse": map_from_world.apply(points)})
 
 
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
@@ -181,7 +183,7 @@ IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 def figures(judged) -> dict[str, float]:
     """Every number of the sparse model, flat."""
-    found = judged.result["maps"][0]["sparse"]
+    found = judged.as_dict()["maps"][0]["sparse"]
     flat = {k: v for k, v in found.items() if not isinstance(v, dict)}
     return flat | {f"{k}/{n}": v for k, inner in found.items() if isinstance(inner, dict) for n, v in inner.items()}
 
@@ -228,8 +230,8 @@ def test_a_map_that_may_be_turned_about_its_line_of_travel_gets_no_surface_figur
     given = replace(model(0, IDENTITY), trajectory=in_order(0, list(range(10)), centers))
     with pytest.raises(InputError, match="may be turned about its line of travel, and its surface cannot be compared"):
         judge_maps([given], replace(world, poses=straight))
-    alone = judge_maps([replace(given, clouds={})], replace(world, poses=straight)).result
-    assert alone["kind"] == "trajectory" and alone["maps"][0]["rms_ate_mm"] < 1
+    alone = judge_maps([replace(given, clouds={})], replace(world, poses=straight)).judged
+    assert not alone.pooled and alone.maps[0].aligned.rms_ate_mm < 1
 
 
 def test_a_mesh_beside_the_frames_is_the_truth_unless_it_is_another_s(tmp_path, world):
@@ -257,7 +259,7 @@ def test_a_mesh_beside_the_frames_is_the_truth_unless_it_is_another_s(tmp_path, 
 
 def test_a_sequence_with_poses_alone_judges_trajectories_and_one_with_neither_nothing():
     frames = [replace(f, true_distance=None) for f in colon(0).frames]
-    judged = judge_maps([model(0, IDENTITY)], read_truth(sequence(frames))).result
+    judged = judge_maps([model(0, IDENTITY)], read_truth(sequence(frames))).as_dict()
     assert judged["kind"] == "trajectory" and judged["all"] == {} and "sparse" not in judged["maps"][0]
     assert judged["truth"]["cloud"] == "the sequence has true poses but no true depth"
     with pytest.raises(InputError, match="no frame has a true pose"):

@@ -103,8 +103,8 @@ def test_se3_keeps_the_map_s_scale_and_is_left_out_where_that_is_not_known():
     found = align_trajectory(trajectory(source), poses(target), 1.2 * scale)
     by_hand = np.linalg.norm(horn(1.2 * scale * source, target, False) - target, axis=1)
     np.testing.assert_allclose(found.ate_se3, by_hand, atol=1e-9)
-    assert found.summary()["rms_ate_se3_mm"] > found.summary()["rms_ate_mm"]
-    assert align_trajectory(trajectory(source), poses(target)).summary()["rms_ate_se3_mm"] is None
+    assert found.summary().rms_ate_se3_mm > found.summary().rms_ate_mm
+    assert align_trajectory(trajectory(source), poses(target)).summary().rms_ate_se3_mm is None
 
 
 def test_submaps_are_averaged_as_climb_does_and_pooled_over_their_poses():
@@ -118,25 +118,23 @@ def test_submaps_are_averaged_as_climb_does_and_pooled_over_their_poses():
     found = trajectory_summary(aligned, trajectories, range(600))
     squares = [((horn(s, t, True) - t) ** 2).sum(1) for s, t in parts]
     a, b = (np.sqrt(s.mean()) for s in squares[:2])
-    assert CLIMB_POSES == 100 and found["climb_submaps"] == 2
-    assert found["climb_ate_mm"] == pytest.approx((120 * a + 300 * b) / 420, rel=1e-9)
-    assert found["rms_ate_mm"] == pytest.approx(np.sqrt(np.concatenate(squares).mean()), rel=1e-9)
-    assert (found["frames_localised"], found["localised_share"]) == (460, 460 / 600)
-    assert found["keyframes"] == 24 + 60 + 8 and found["submaps"] == 3
+    assert CLIMB_POSES == 100 and found.climb_submaps == 2
+    assert found.climb_ate_mm == pytest.approx((120 * a + 300 * b) / 420, rel=1e-9)
+    assert found.rms_ate_mm == pytest.approx(np.sqrt(np.concatenate(squares).mean()), rel=1e-9)
+    assert (found.frames_localised, found.localised_share) == (460, 460 / 600)
+    assert found.keyframes == 24 + 60 + 8 and found.submaps == 3
     few = trajectory_summary(aligned[2:], trajectories[2:], range(600))
-    assert few["climb_ate_mm"] is None and few["climb_submaps"] == 0
+    assert few.climb_ate_mm is None and few.climb_submaps == 0
 
 
 def test_a_frame_in_two_submaps_is_localised_once_and_keyframes_alone_tell_no_share():
     source, target = case(0, 20)
     twice = [trajectory(source, map_id=0), trajectory(source, map_id=1)]
     aligned = [align_trajectory(t, poses(target)) for t in twice]
-    assert trajectory_summary(aligned, twice, range(40))["localised_share"] == 0.5
+    assert trajectory_summary(aligned, twice, range(40)).localised_share == 0.5
     alone = [trajectory(source, whole=False)]
     found = trajectory_summary(aligned[:1], alone, range(40))
-    assert found["localised_share"] is None and found["localised_of"] == (
-        "not known: the trajectory holds keyframes alone"
-    )
+    assert found.localised_share is None and found.localised_of == ("not known: the trajectory holds keyframes alone")
 
 
 def test_what_cannot_be_aligned_is_refused_by_name():
@@ -203,7 +201,7 @@ def test_a_multi_map_tree_brings_every_localised_frame(tmp_path):
     summary = trajectory_summary(
         [align_trajectory(t, {f.number: f.true_world_from_cam for f in frames}) for t in found], found, range(10)
     )
-    assert summary["frames_localised"] == len({*found[0].numbers.tolist(), *found[1].numbers.tolist()})
+    assert summary.frames_localised == len({*found[0].numbers.tolist(), *found[1].numbers.tolist()})
 
 
 def test_a_file_that_is_no_trajectory_is_refused(tmp_path):

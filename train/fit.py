@@ -13,10 +13,10 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import lightning.pytorch as pl
 import torch
@@ -40,8 +40,10 @@ from lightdepth.reporting.run import input_hash, versions, write_run_json
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
 from .callbacks import Diagnosis, DiagnosisConfig, Panels, Progress, validation_line
+from .card import Card, Doubt
+from .colons import TubeData
 from .datamodule import FrameDataModule
-from .running import card_text, quiet, report_every
+from .running import quiet, report_every
 
 _OURS = (
     *("config.yaml", "log.txt", "tensorboard", "checkpoints", "model.safetensors", "model.md", "uncertainty.png"),
@@ -92,7 +94,7 @@ def fit(
     model: LightDepth,
     data: FrameDataModule,
     output: Path,
-    trainer_options: dict[str, Any],
+    trainer_options: Mapping[str, object],
     config_yaml: str,
     seed: int,
     resume: bool = False,
@@ -129,7 +131,8 @@ def fit(
     echo(
         f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
     )
-    trainer = pl.Trainer(**_with_callbacks(trainer_options, output, echo, data, settings))
+    options = _with_callbacks(trainer_options, output, echo, data, settings)
+    trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the command line's parser checked them against Trainer
     if resume:
         echo(f"resuming from {last.name}" if resumed else "nothing to resume: starting anew")
     trainer.fit(model, datamodule=data, ckpt_path=resumed, weights_only=True)
@@ -147,9 +150,22 @@ def fit(
         doubt = _calibrate(exported.network, data, output) if model.loss_config.uncertainty > 0 else None
         # Not the trainer's step: of processes started for the fit alone, it never hears.
         steps = int(torch.load(last, map_location="cpu", weights_only=True)["global_step"])
-        card = _card(model, data, steps, seed, chosen.stem, errors, settings, doubt)
-        save_model(exported.network, output / "model.safetensors", card)
-        write_whole(output / "model.md", card_text(card, output.name))
+        card = TrainedCard(
+            trained_on=_trained_on(model, data),
+            rows=model.rows,
+            steps=steps,
+            seed=seed,
+            checkpoint=chosen.stem,
+            network=model.network.config,
+            loss=model.loss_config,
+            fit=settings,
+            uncertainty=doubt,
+            tube=data.tube if data.tube.scenes or data.tube.val_scenes else None,
+            errors=errors,
+            version=versions().get("lightdepth", "not installed"),
+        )
+        save_model(exported.network, output / "model.safetensors", card.record())
+        write_whole(output / "model.md", card.text(output.name))
         echo(f"exported the {chosen.stem} checkpoint to {output / 'model.safetensors'}")
         record = {
             "seed": seed,
@@ -181,7 +197,7 @@ def doubted_frames(network: DepthNetwork, data: FrameDataModule) -> list[Doubted
     return frames
 
 
-def _calibrate(network: DepthNetwork, data: FrameDataModule, output: Path) -> dict[str, Any] | None:
+def _calibrate(network: DepthNetwork, data: FrameDataModule, output: Path) -> Doubt | None:
     """Calibrates the uncertainty head on the validation frames that have truth, and says how good it is on them."""
     assert network.uncertainty is not None
     frames = doubted_frames(network, data)
@@ -191,7 +207,14 @@ def _calibrate(network: DepthNetwork, data: FrameDataModule, output: Path) -> di
     _set_calibration(network, fitted)
     frames = [Doubted(frame.error, fitted(frame.sigma)) for frame in frames]
     write_whole(output / "uncertainty.png", chart_png(frames))
-    return {"exponent": round(fitted.exponent, 4), "scale": round(fitted.scale, 4), **summary(frames)}
+    found = summary(frames)
+    return {
+        "exponent": round(fitted.exponent, 4),
+        "scale": round(fitted.scale, 4),
+        "sparsification": found["sparsification"],
+        "coverage": found["coverage"],
+        "frames": found["frames"],
+    }
 
 
 def _set_calibration(network: DepthNetwork, fitted: Calibration) -> None:
@@ -220,11 +243,12 @@ class _SaveLast(pl.Callback):
 
 
 def _with_callbacks(
-    given: dict[str, Any], output: Path, echo: Callable[[str], None], data: FrameDataModule, settings: FitConfig
-) -> dict[str, Any]:
+    given: Mapping[str, object], output: Path, echo: Callable[[str], None], data: FrameDataModule, settings: FitConfig
+) -> dict[str, object]:
     """Trainer options completed by the run's logger, checkpoints and progress."""
     options = dict(given)
-    interval, steps = options.get("val_check_interval"), options.get("max_steps") or -1
+    interval, asked = options.get("val_check_interval"), options.get("max_steps")
+    steps = asked if isinstance(asked, int) and asked else -1
     if isinstance(interval, int) and 0 < steps < interval:
         options["val_check_interval"] = interval = steps  # a short run is validated once, at its end
     if options.get("logger") in (None, True):
@@ -266,16 +290,27 @@ def _with_callbacks(
     return options
 
 
-def _card(
-    model: LightDepth,
-    data: FrameDataModule,
-    steps: int,
-    seed: int,
-    checkpoint: str,
-    errors: dict[str, float],
-    settings: FitConfig,
-    doubt: dict[str, Any] | None,
-) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True)
+class TrainedCard(Card):
+    """The card of a checkpoint that was trained from the start."""
+
+    fit: FitConfig
+    """how the run was watched, averaged and stopped"""
+    tube: TubeData | None
+    """synthetic colons that it was trained or validated on, if any"""
+
+    def record(self) -> dict[str, object]:
+        shared = super().record()
+        errors, version = shared.pop("errors"), shared.pop("version")
+        own = {
+            "fit": asdict(self.fit),
+            "uncertainty": self.uncertainty,
+            "tube": None if self.tube is None else asdict(self.tube),
+        }
+        return {**shared, **own, "errors": errors, "version": version}
+
+
+def _trained_on(model: LightDepth, data: FrameDataModule) -> str:
     tube = data.tube
     parts = [f"{len(data.sequences)} sequences{_of_split(data.split)}"] if data.sequences else []
     if tube.scenes:
@@ -283,20 +318,7 @@ def _card(
     truth = "with true distance in the loss" if model.loss_config.supervised > 0 else "no truth in the loss"
     if model.loss_config.uncertainty > 0:
         truth += " of distance; the uncertainty head alone learned from true distance"
-    return {
-        "trained_on": f"{' and '.join(parts)}, {data.size[0]}x{data.size[1]} pixels; {truth}.",
-        "rows": model.rows,
-        "steps": steps,
-        "seed": seed,
-        "checkpoint": checkpoint,
-        "network": model.network.config.to_dict(),
-        "loss": asdict(model.loss_config),
-        "fit": asdict(settings),
-        "uncertainty": doubt,
-        "tube": asdict(tube) if tube.scenes or tube.val_scenes else None,
-        "errors": errors,
-        "version": versions().get("lightdepth", "not installed"),
-    }
+    return f"{' and '.join(parts)}, {data.size[0]}x{data.size[1]} pixels; {truth}."
 
 
 def _of_split(split: str | None) -> str:

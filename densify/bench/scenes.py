@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from densify.evaluation.judge import Truth, read_truth
+from densify.evaluation.truth import Truth, read_truth
 from lightdepth.datasets import FrameSequence
 from lightdepth.tube import ShapeConfig, Tube, TubeConfig, lens, realistic, render_sequence
 from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam

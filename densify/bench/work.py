@@ -18,7 +18,8 @@ from densify.bench.scenes import Rendered, Scene, Size, render
 from densify.config import DensifyConfig, Recipe
 from densify.dense_map import DenseMap
 from densify.evaluation.errors import compare_depth, rms
-from densify.evaluation.judge import Model, judge_maps
+from densify.evaluation.judge import judge_maps
+from densify.evaluation.judged_map import JudgedMap
 from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
 from densify.pipeline import densify
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -104,7 +105,7 @@ def _cell(scene: Predicted, share: float, config: BenchConfig, on_row: Callable[
     sparse_map = rendered.slam(share).map
     sparse = [_model(s, sparse=s.points) for s in sparse_map.submaps]
     rows: dict[str, Any] = {}
-    inliers: list[Model] = []
+    inliers: list[JudgedMap] = []
     for model, known in scene.predictions.items():
         for recipe in config.recipes:
             chosen = config.densify.under(recipe)
@@ -127,11 +128,11 @@ def _known(predictions: Mapping[str, DepthPrediction], frame: Frame) -> DepthPre
     return predictions[frame.name]
 
 
-def _model(submap: Submap, **clouds: np.ndarray) -> Model:
-    return Model(keyframe_trajectory(submap), clouds)
+def _model(submap: Submap, **clouds: np.ndarray) -> JudgedMap:
+    return JudgedMap(keyframe_trajectory(submap), clouds)
 
 
-def _trajectory(models: Sequence[Model], rendered: Rendered) -> dict[str, Any]:
+def _trajectory(models: Sequence[JudgedMap], rendered: Rendered) -> dict[str, Any]:
     aligned = []
     for model in models:
         with suppress(InputError):
@@ -141,9 +142,9 @@ def _trajectory(models: Sequence[Model], rendered: Rendered) -> dict[str, Any]:
     return {"keyframes": len(keyframes), "submaps": len(models), "submaps_aligned": len(aligned), "rms_ate_mm": error}
 
 
-def _judged(models: Sequence[Model], rendered: Rendered, cloud: str) -> dict[str, Any]:
+def _judged(models: Sequence[JudgedMap], rendered: Rendered, cloud: str) -> dict[str, Any]:
     try:
-        result = judge_maps(models, rendered.truth).result
+        result = judge_maps(models, rendered.truth).as_dict()
     except InputError as error:
         return {"error": str(error)}
     if cloud not in result["all"]:

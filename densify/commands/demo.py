@@ -6,8 +6,10 @@ from pathlib import Path
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
-from densify.evaluation.judge import dense_models, judge_maps, read_run, read_truth
+from densify.evaluation.judge import judge_maps
+from densify.evaluation.judged_map import dense_models, read_run
 from densify.evaluation.tables import write_evaluations
+from densify.evaluation.truth import read_truth
 from densify.page import densify_page
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import open_sequence
@@ -70,13 +72,18 @@ def demo(
         work.write(run, ("ply",), None)
         evaluation = judge_maps(dense_models(read_run(run.folder)), read_truth(data))
         run.log(write_evaluations({"demo": evaluation}, run.folder))
-        run.record["evaluation"] = evaluation.result["maps"]
+        run.record["evaluation"] = [found.record() for found in evaluation.judged.maps]
         notes = [
             f"A synthetic colon (seed {seed}), {frames} frames, a simulated SLAM export of {len(sparse_map.submaps)} "
             f"submaps with {spurious:.0%} wrong points; depth by {work.model}. Truth is exact, so errors are errors.",
         ]
         page = densify_page(
-            "Demo: from frames to a dense surface", work.results, work.baselines, work.gallery, notes, evaluation.result
+            "Demo: from frames to a dense surface",
+            work.results,
+            work.baselines,
+            work.gallery,
+            notes,
+            evaluation.judged.maps,
         )
         page.write(run.folder / "report.html")
         run.log(f"{output}/report.html")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.evaluation.judge import read_run
+from densify.evaluation.judged_map import read_run
 from densify.measure import chosen_map, measured, places_in_frame, run_unit, summary
 from lightdepth.errors import InputError
 from lightdepth.files.writing import write_whole

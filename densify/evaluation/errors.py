@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from densify.dense_map import DenseMapFiles, Surface
+from densify.evaluation.records import DistanceFigures, Gap, SurfaceFigures
 from densify.similarity import Similarity
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
@@ -157,26 +157,28 @@ class SurfaceErrors:
     to_mesh: np.ndarray | None
     completeness: np.ndarray
 
-    def summary(self, thresholds_mm: Sequence[float]) -> dict[str, Any]:
+    def summary(self, thresholds_mm: Sequence[float]) -> SurfaceFigures:
         """Figures for the report. Precision, recall: shares of model and true points within each threshold."""
-        found: dict[str, Any] = {"points": len(self.accuracy), **_figures(self.accuracy)}
-        found["to_mesh"] = None if self.to_mesh is None else _figures(self.to_mesh)
-        found["completeness"] = _figures(self.completeness)
-        for name, distance in (("precision", self.accuracy), ("recall", self.completeness)):
-            found[name] = {f"{t:g}mm": float((distance <= t).mean()) for t in thresholds_mm}
-        found["f_score"] = {
-            key: 2 * p * r / (p + r) if p + r else 0.0
-            for key, p, r in zip(found["precision"], found["precision"].values(), found["recall"].values(), strict=True)
-        }
-        return found
+        precision, recall = (
+            {f"{t:g}mm": float((distance <= t).mean()) for t in thresholds_mm}
+            for distance in (self.accuracy, self.completeness)
+        )
+        accuracy = DistanceFigures.of(self.accuracy)
+        return SurfaceFigures(
+            points=len(self.accuracy),
+            rms_mm=accuracy.rms_mm,
+            median_mm=accuracy.median_mm,
+            p90_mm=accuracy.p90_mm,
+            to_mesh=None if self.to_mesh is None else DistanceFigures.of(self.to_mesh),
+            completeness=DistanceFigures.of(self.completeness),
+            precision=precision,
+            recall=recall,
+            f_score={key: _harmonic_mean(precision[key], recall[key]) for key in precision},
+        )
 
 
-def _figures(distance: np.ndarray) -> dict[str, float]:
-    return {
-        "rms_mm": rms(distance),
-        "median_mm": float(np.median(distance)),
-        "p90_mm": float(np.quantile(distance, 0.9)),
-    }
+def _harmonic_mean(p: float, r: float) -> float:
+    return 2 * p * r / (p + r) if p + r else 0.0
 
 
 def surface_errors(model: np.ndarray, truth: TrueSurface) -> SurfaceErrors:
@@ -286,16 +288,6 @@ def evaluate_depth(
     found = compare_depth(prediction, frame, max_depth_mm)
     counts = {"pixels": int(found.valid.sum()), "share_of_image": found.share_of_image}
     return {**found.errors(alignments or ALIGNMENTS), **counts, "share_of_truth": found.share_of_truth}
-
-
-@dataclass(frozen=True)
-class Gap:
-    """|d1 - d2| / d1 along common rays, d the distances from the camera to two surfaces."""
-
-    rays: int
-    median: float
-    p90: float
-    both_share: float
 
 
 def surface_gap(first: DenseMapFiles, second: DenseMapFiles, second_from_first: Similarity, stride: int = 16) -> Gap:

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from densify.evaluation.errors import ate, rms, sideways_agreement
+from densify.evaluation.records import AlignedFigures, TrajectoryFigures
 from densify.similarity import Similarity, fit_similarity
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
@@ -128,14 +128,14 @@ class AlignedTrajectory:
     ate_se3: np.ndarray | None
     sideways: float
 
-    def summary(self) -> dict[str, Any]:
-        return {
-            "poses": len(self.numbers),
-            "rms_ate_mm": rms(self.ate_sim3),
-            "rms_ate_se3_mm": None if self.ate_se3 is None else rms(self.ate_se3),
-            "mm_per_unit": self.true_from_map.scale,
-            "sideways_agreement": self.sideways,
-        }
+    def summary(self) -> AlignedFigures:
+        return AlignedFigures(
+            poses=len(self.numbers),
+            rms_ate_mm=rms(self.ate_sim3),
+            rms_ate_se3_mm=None if self.ate_se3 is None else rms(self.ate_se3),
+            mm_per_unit=self.true_from_map.scale,
+            sideways_agreement=self.sideways,
+        )
 
 
 def align_trajectory(
@@ -159,31 +159,28 @@ def align_trajectory(
 
 def trajectory_summary(
     aligned: Sequence[AlignedTrajectory], trajectories: Sequence[Trajectory], numbers: Sequence[int]
-) -> dict[str, Any]:
-    """Of all submaps together, out of the sequence's frames by number.
-
-    rms_ate_mm is over all poses, each after its own submap's Sim(3); climb_ate_mm is CLiMB's mean of the submaps'.
-    """
+) -> TrajectoryFigures:
+    """Of all submaps together, out of the sequence's frames by number; how long each took is not known here."""
     located = {n for t in trajectories for n in t.numbers.tolist()} & set(numbers)
     whole = any(t.whole for t in trajectories)
     counted = [a for a in aligned if len(a.numbers) >= CLIMB_POSES]
     poses = [len(a.numbers) for a in counted]
     rigid = [a.ate_se3 for a in aligned if a.ate_se3 is not None]
-    return {
-        "frames": len(numbers),
-        "frames_localised": len(located) if whole else None,
-        "localised_share": len(located) / len(numbers) if whole else None,
-        "localised_of": "all frames" if whole else "not known: the trajectory holds keyframes alone",
-        "keyframes": len({n for t in trajectories for n in t.numbers[t.keyframe].tolist()}),
-        "submaps": len(trajectories),
-        "submaps_aligned": len(aligned),
-        "poses": sum(len(a.numbers) for a in aligned),
-        "rms_ate_mm": rms(np.concatenate([a.ate_sim3 for a in aligned])),
-        "rms_ate_se3_mm": rms(np.concatenate(rigid)) if rigid else None,
-        "climb_ate_mm": float(np.average([rms(a.ate_sim3) for a in counted], weights=poses)) if counted else None,
-        "climb_submaps": len(counted),
-        "climb_rule": f"mean over submaps of at least {CLIMB_POSES} poses, weighted by their number",
-    }
+    return TrajectoryFigures(
+        frames=len(numbers),
+        frames_localised=len(located) if whole else None,
+        localised_share=len(located) / len(numbers) if whole else None,
+        localised_of="all frames" if whole else "not known: the trajectory holds keyframes alone",
+        keyframes=len({n for t in trajectories for n in t.numbers[t.keyframe].tolist()}),
+        submaps=len(trajectories),
+        submaps_aligned=len(aligned),
+        poses=sum(len(a.numbers) for a in aligned),
+        rms_ate_mm=rms(np.concatenate([a.ate_sim3 for a in aligned])),
+        rms_ate_se3_mm=rms(np.concatenate(rigid)) if rigid else None,
+        climb_ate_mm=float(np.average([rms(a.ate_sim3) for a in counted], weights=poses)) if counted else None,
+        climb_submaps=len(counted),
+        climb_rule=f"mean over submaps of at least {CLIMB_POSES} poses, weighted by their number",
+    )
 
 
 def span(numbers: Sequence[int] | np.ndarray) -> str:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel
 
 from densify.dense_map import DenseMap
+from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.observations import ObservedDistances
 from lightdepth.sparse_map import Keyframe
 
@@ -28,8 +31,8 @@ class Withheld:
     """90th percentile of the shares, misses included"""
     miss: float
     """share of the points whose rays miss the surface"""
-    median_met: float
-    """median share of the points whose rays meet the surface"""
+    median_met: float | None = None
+    """median share of the points whose rays meet the surface; None where a run folder does not say it"""
 
     @classmethod
     def of(cls, dense: DenseMap, withheld: Sequence[tuple[Keyframe, ObservedDistances]]) -> Withheld | None:
@@ -46,3 +49,57 @@ class Withheld:
         median, p90 = (float(np.quantile(error, q, method="higher")) for q in (0.5, 0.9))
         median_met = float(np.median(met)) if len(met) else np.inf
         return cls(len(error), median, p90, 1 - len(met) / len(error), median_met)
+
+
+@dataclass(frozen=True)
+class WithheldOfMap:
+    """The withheld points of one map, with a constant distance's beside."""
+
+    map_id: int
+    withheld: Withheld
+    constant: Withheld | None = None
+    sequence: str = ""
+    """which sequence the map is of, where several are judged"""
+
+    def record(self) -> dict[str, object]:
+        """As metrics.json has it."""
+        both = {"withheld": _told(self.withheld), "withheld_constant": self.constant and _told(self.constant)}
+        return {"map": self.map_id, **both, **({"sequence": self.sequence} if self.sequence else {})}
+
+
+def _told(withheld: Withheld) -> dict[str, float]:
+    return {name: value for name, value in asdict(withheld).items() if value is not None}
+
+
+class _Withheld(BaseModel):
+    points: int
+    median: float | None
+    p90: float | None
+    miss: float
+    median_met: float | None = None
+
+    def read(self) -> Withheld:
+        """JSON has no infinity: null stands for it."""
+        median, p90, met = (np.inf if v is None else v for v in (self.median, self.p90, self.median_met))
+        return Withheld(self.points, median, p90, self.miss, met if "median_met" in self.model_fields_set else None)
+
+
+class _Map(BaseModel):
+    map: int
+    withheld: _Withheld
+    withheld_constant: _Withheld | None = None
+
+
+def withheld_errors(folder: Path) -> list[WithheldOfMap]:
+    """What a densify run says of the points that it withheld: the judge where there is no truth. Empty where nothing
+    was withheld. Raises InputError where run.json does not say it as `densify` does."""
+    file = folder / "run.json"
+    if not file.is_file():
+        return []
+    found = []
+    for told in read_json(file).get("maps", []):
+        if isinstance(told, dict) and told.get("withheld"):
+            entry = checked_fields(_Map, told, f"{file}: maps")
+            constant = None if entry.withheld_constant is None else entry.withheld_constant.read()
+            found.append(WithheldOfMap(entry.map, entry.withheld.read(), constant))
+    return found

@@ -19,7 +19,7 @@ _WORK = """
 import json, resource, time
 import numpy as np
 from scipy.spatial import cKDTree
-from densify.evaluation import TrueSurface, closest
+from densify.evaluation.errors import TrueSurface, closest
 
 def wall(n, noise, seed):  # a tube of 40 mm with folds, as dense as C3VD's truth
     rng = np.random.default_rng(seed)

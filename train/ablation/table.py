@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TypedDict
 
 import numpy as np
 
@@ -23,9 +23,7 @@ from lightdepth.files.writing import write_whole
 from lightdepth.reporting.run import git_revision
 
 from ..colons import TubeData, colon_seeds
-
-if TYPE_CHECKING:
-    from .run import JudgedColons, Row
+from .rows import JudgedColons, Row
 
 METRICS = {"abs_rel": "AbsRel", "rmse_mm": "RMSE", "medae_mm": "MedAE"}
 _TOLD = {"true": "the true one", "wrong": "one .3 too high", "estimated": "one estimated per colon, without truth"}
@@ -169,7 +167,18 @@ def write_table(table: Table, output: Path, copy: Path | None) -> None:
         write_whole(copy, text)
 
 
-def _summary(line: Line) -> dict[str, Any]:
+class _Summary(TypedDict):
+    """A line of the table in ablation.json."""
+
+    row: str
+    seeds: list[int]
+    overall: list[float]
+    difference: list[float]
+    verdict: str
+    ratios: list[list[float]]
+
+
+def _summary(line: Line) -> _Summary:
     overall, difference = line.overall(), line.overall_differences()
     return {
         "row": line.name,

@@ -12,9 +12,8 @@ Where a map teaches (train.adapting.map_teacher), its two terms come on top, fro
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -29,8 +28,6 @@ from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
 from lightdepth.network.model import full_precision
 from train.adapting.map_teacher import MapTeacher, map_terms
-
-from ..colons import TubeData
 
 What = Literal["all", "decoder", "norms", "low_rank"]
 WHAT = ("all", "decoder", "norms", "low_rank")
@@ -88,42 +85,6 @@ def anchor_loss(distance: Tensor, start: Tensor, mask: Tensor) -> Tensor:
     """Mean |log t - log t_start| inside the mask, after each image's median of it is taken out. All (B, 1, H, W)."""
     ratio = distance.log() - start.log()
     return mean_over_images((ratio - masked_median(ratio, mask)).abs(), mask)
-
-
-def target_loss(card: dict[str, Any], reflectance_known: bool, replayed: bool) -> LossConfig:
-    """The loss of a checkpoint's card (the defaults without one), fit for frames without truth: free of gain.
-
-    Terms with truth stay for replayed colons only. Where the card takes each image's calibrated reflectance and the
-    target's is not known, it is the default's.
-    """
-    default = LossConfig()
-    try:
-        own = LossConfig(**card.get("loss", {}))
-    except TypeError as error:
-        raise InputError(f"the checkpoint's card has a loss that is not known here ({error})") from error
-    reflectance = own.reflectance
-    if reflectance is None and not reflectance_known:
-        reflectance = default.reflectance
-    return replace(
-        own,
-        gain="free",
-        reflectance=reflectance,
-        photometric=own.photometric or default.photometric,
-        self_supervised=own.self_supervised or default.self_supervised,
-        supervised=own.supervised if replayed else 0.0,
-        uncertainty=0.0,
-    )
-
-
-def source_colons(card: dict[str, Any], scenes: int) -> TubeData:
-    """So many colons of the kind that a checkpoint's card says it was trained on; of the default kind without one."""
-    own = card.get("tube") or {}
-    known: dict[str, Any] = {
-        name: tuple(own[name]) if isinstance(own[name], list) else own[name]
-        for name in ("frames", "travel", "lenses", "mu", "gamma", "reflectance", "family")
-        if name in own
-    }
-    return TubeData(scenes=scenes, **known)
 
 
 class Adaptation(LightDepth):

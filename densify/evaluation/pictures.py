@@ -1,0 +1,65 @@
+"""Pictures of errors: their cumulative curves, and surfaces coloured by them."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from densify.evaluation.records import EDGES_MM, DepthJudged, ErrorMesh, Evaluation, MapsJudged
+from lightdepth.reporting.figures import chart, chart_png, mesh_picture, png, side_by_side
+
+MODELS = {"sparse": "Sparse map", "sparse_inliers": "Sparse inliers", "dense": "Dense"}
+"""The names of the point clouds, for people."""
+_COLOR_MM = 5.0
+
+
+def curve_picture(evaluation: Evaluation[DepthJudged | MapsJudged]) -> bytes:
+    """Share of model points (or pixels) within each error, over the error's logarithm."""
+    depth = isinstance(evaluation.judged, DepthJudged)
+    figure, axes = chart((6.4, 3.6))
+    for name, share in evaluation.curves.items():
+        axes.plot(EDGES_MM, 100 * share, label=name if depth else MODELS[name], linewidth=1.8)
+    axes.set_xscale("log")
+    axes.set_xlim(EDGES_MM[0], EDGES_MM[-1])
+    axes.set_ylim(0, 100)
+    axes.set_xticks([0.1, 1, 10, 100], ["0.1", "1", "10", "100"])
+    axes.set_xlabel("error of depth [mm]" if depth else "distance to the closest true point [mm]")
+    axes.set_ylabel("pixels [%]" if depth else "model points [%]")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, loc="upper left", title="alignment" if depth else None)
+    return chart_png(figure)
+
+
+def error_colors(distance: np.ndarray) -> np.ndarray:
+    """(n, 3) in [0, 1]: from blue (0) over green and yellow to red (5 mm and more)."""
+    level = np.rint(255 * (0.08 + 0.87 * np.clip(distance / _COLOR_MM, 0, 1))).astype(np.uint8)
+    return cv2.applyColorMap(level.reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0, ::-1] / 255
+
+
+def write_error_mesh(mesh: ErrorMesh, path: Path) -> None:
+    """A PLY in the true world [mm], coloured, with each vertex's distance as `error_mm`."""
+    import trimesh
+
+    colors = np.rint(255 * error_colors(mesh.distance)).astype(np.uint8)
+    made = trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=colors, process=False)
+    made.vertex_attributes["error_mm"] = mesh.distance.astype(np.float32)
+    made.export(path)
+
+
+def error_picture(mesh: ErrorMesh) -> bytes:
+    """The coloured surface from outside, and what the colours mean."""
+    picture = mesh_picture(mesh.vertices, mesh.triangles, error_colors(mesh.distance))
+    height, top, bottom = picture.shape[0], 70, 40
+    scale = np.full((height, 150, 3), 255, np.uint8)
+    steps = np.linspace(_COLOR_MM, 0, height - top - bottom)
+    scale[top : height - bottom, 20:44] = np.rint(255 * error_colors(steps))[:, None]
+    write = partial(cv2.putText, scale, fontFace=cv2.FONT_HERSHEY_SIMPLEX, color=(60, 60, 60), lineType=cv2.LINE_AA)
+    for line, words in enumerate(("distance to the", "closest true point")):
+        write(text=words, org=(6, 24 + 18 * line), fontScale=0.42)
+    for mm in range(int(_COLOR_MM) + 1):
+        row = round(height - bottom - mm / _COLOR_MM * (height - top - bottom))
+        write(text=f"{mm:g} mm" + " and more" * (mm == _COLOR_MM), org=(50, row + 5), fontScale=0.42)
+    return png(side_by_side([picture, scale]))

@@ -1,0 +1,139 @@
+"""What a sequence knows of the world that it shows, to judge by: true poses, and the wall where there is true depth."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from densify.dense_map import Surface
+from densify.evaluation.errors import CUBE_MM, TrueSurface, depth_triangles, true_cloud
+from densify.evaluation.trajectory import span
+from lightdepth.datasets import FrameSequence
+from lightdepth.errors import InputError
+from lightdepth.frame import Frame
+
+COVERAGE_MESH = "coverage_mesh.obj"
+"""C3VD's true surface, in the frame of reference of its poses."""
+_MESH_FRAMES, _MESH_TRIANGLES = 50, 2_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a sequence knows: true poses (4, 4) [mm] by frame number, all its frames' numbers, seconds between frames,
+    and the wall, or why there is none."""
+
+    source: str
+    poses: Mapping[int, np.ndarray]
+    numbers: Sequence[int]
+    period: float | None
+    surface: TrueSurface | None
+    no_surface: str = ""
+
+
+def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bool = True) -> Truth:
+    """Poses of every frame and, where there is true depth, the wall. Frames are read once, one at a time.
+
+    The true mesh is the one given; else C3VD's own, beside its frames; else the triangulated true depth of some frames.
+    Raises InputError when no frame has a pose.
+    """
+    poses: dict[int, np.ndarray] = {}
+    times: list[float] = []
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
+    order = np.argsort(frames.numbers, kind="stable")
+    if mesh is None and (Path(frames.source) / COVERAGE_MESH).is_file():
+        mesh = Path(frames.source) / COVERAGE_MESH
+    chosen = set() if mesh else set(order[:: -(-len(order) // _MESH_FRAMES)].tolist())
+    any_depth = False
+
+    def watched() -> Iterator[Frame]:
+        nonlocal any_depth
+        for i in order.tolist():
+            frame = frames[i]
+            if frame.true_world_from_cam is not None:
+                poses[frame.number] = frame.true_world_from_cam
+            if frame.time is not None:
+                times.append(frame.time)
+            any_depth |= frame.true_distance is not None and frame.true_world_from_cam is not None
+            if with_surface:
+                if i in chosen:
+                    step = np.sqrt(2 * len(chosen) * frame.camera.width * frame.camera.height / _MESH_TRIANGLES)
+                    parts.append(depth_triangles(frame, max(1, int(np.ceil(step)))))
+                yield frame
+
+    cloud = None
+    try:
+        cloud = true_cloud(watched())
+    except InputError:
+        if any_depth and with_surface:
+            raise
+    if not poses:
+        raise InputError(f"{frames.source}: no frame has a true pose; a trajectory or a surface needs them")
+    period = float(np.median(np.diff(times))) if len(times) > 1 else None
+    common = (frames.source, poses, sorted(frames.numbers), period)
+    if cloud is None:
+        return Truth(*common, None, "the sequence has true poses but no true depth" if with_surface else "")
+    sampling = (
+        f"{len(cloud)} points: every second pixel of {len(frames)} frames unprojected at true poses, one point kept in "
+        f"each cube of {CUBE_MM:g} mm"
+    )
+    if mesh is not None:
+        vertices, triangles = read_mesh(mesh)
+        source = f"{mesh.name}, {len(triangles)} triangles"
+    else:
+        counts = np.cumsum([0, *(len(v) for v, _ in parts)])
+        vertices = np.concatenate([v for v, _ in parts])
+        triangles = np.concatenate([t + n for (_, t), n in zip(parts, counts, strict=False)])
+        source = f"true depth of {len(parts)} frames triangulated, {len(triangles)} triangles"
+    surface = Surface(vertices, triangles) if len(triangles) else None
+    if mesh is not None and surface is not None:
+        off = float(np.median(surface.distance(cloud[:: max(1, len(cloud) // 5000)])))
+        if off > 2:
+            raise InputError(
+                f"{mesh}: the true depth is {off:.3g} mm from it (median); expected the surface that the sequence "
+                "shows, in mm, in the frame of reference of its poses"
+            )
+    return Truth(*common, TrueSurface(cloud, sampling, surface, source))
+
+
+def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) and triangles (m, 3) of a PLY, OBJ, STL or GLB. Raises InputError when it is none."""
+    import trimesh
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such mesh")
+    try:
+        mesh: Any = trimesh.load(path, process=False, force="mesh", skip_materials=True)
+        vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, int)
+    except Exception as error:  # whatever a broken file makes the reader stumble over
+        raise InputError(f"{path}: not a mesh that can be read ({type(error).__name__}: {error})") from error
+    if not len(triangles):
+        raise InputError(f"{path}: no triangles in it")
+    return vertices, triangles
+
+
+def shared_frames(ours: Collection[int], theirs: Sequence[int], what: str, source: str, common: bool) -> list[int]:
+    """Frame numbers of both, in order. Raises InputError, saying which match, when there is none, or when ours has
+    others too and they are not to be left out (`common`)."""
+    mine, known = sorted(ours), set(theirs)
+    both = [n for n in mine if n in known]
+    if not both:
+        raise InputError(
+            f"{source}: none of its frames is among the {what}: it has {span(theirs)}, they are for {span(mine)}; do "
+            "both count from the same frame? (frame_offset in densify_map.json shifts a map's)"
+        )
+    if len(both) < len(mine) and not common:
+        alone = [n for n in mine if n not in known]
+        raise InputError(
+            f"{source}: it has {span(theirs)}, the {what} are for {span(mine)}: {len(both)} match ({span(both)}), "
+            f"{len(alone)} do not ({_listed(alone)}). Give the truth of the same frames, or --common to judge those "
+            "that match"
+        )
+    return both
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers[:5])) + (f" and {len(numbers) - 5} more" if len(numbers) > 5 else "")

@@ -1,0 +1,206 @@
+"""What the verb evaluate does: it takes what is to be judged, a single sequence or those of a suite, makes maps dense
+first where it is asked to, and judges each against its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from densify.config import DensifyConfig
+from densify.dense_map import map_folders
+from densify.densified import Densified
+from densify.evaluation.judge import THRESHOLDS_MM, judge_maps
+from densify.evaluation.judge_depth import judge_depth
+from densify.evaluation.judged_map import (
+    JudgedMap,
+    dense_models,
+    in_mm,
+    is_made_by_us,
+    read_models,
+    read_run,
+    sparse_models,
+    with_trajectories,
+)
+from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged
+from densify.evaluation.suite import Suite, present, read_suite
+from densify.evaluation.trajectory import read_trajectories, trajectory_files
+from densify.evaluation.truth import read_truth
+from densify.evaluation.withheld import WithheldOfMap, withheld_errors
+from densify.inputs import check_unit, map_and_frames
+from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
+from lightdepth.errors import InputError
+from lightdepth.models import DepthModel
+from lightdepth.presets import shipped
+from lightdepth.reporting.run import Run
+from lightdepth.sfm.reconstruction import SfmConfig
+from lightdepth.sparse_map import SparseMap
+
+
+@dataclass(frozen=True)
+class TruthSource:
+    """What is judged against, and how it is read."""
+
+    truth: Path | None = None
+    """Sequence with true depth, and for maps with true poses; left out, a densify run's withheld points judge."""
+    format: FormatName | None = None
+    """Format of the truth: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if
+    left out."""
+    camera: Path | None = None
+    """Calibration file that wins over the truth's own."""
+    mask: Path | None = None
+    """Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one."""
+    truth_mesh: Path | None = None
+    """File of the true surface, mm, in the frame of the true poses; left out, C3VD's own or triangulated true
+    depth."""
+
+    def sequence(self, folder: Path) -> SequenceSource:
+        """A folder of the truth: itself, or one of its sequences."""
+        return SequenceSource(folder, self.format, self.camera, mask=self.mask)
+
+
+@dataclass(frozen=True)
+class JudgingConfig:
+    """How errors are taken."""
+
+    mm_per_unit: float | None = None
+    """Millimetres per map unit, where known: the error after SE(3) needs it. A larger one makes a larger surface."""
+    thresholds_mm: tuple[float, ...] = THRESHOLDS_MM
+    """Distances, mm, up to which a point counts as right in precision, recall and F-score. Larger ones count more
+    points."""
+    max_depth_mm: float = 100.0
+    """True depth, mm, beyond which pixels take no part in the errors of depth. A larger one judges farther wall
+    too."""
+    common: bool = False
+    """Judge only the frames that both sides have, where there are others."""
+
+    def __post_init__(self) -> None:
+        check_unit(self.mm_per_unit)
+        if not self.thresholds_mm or not all(t > 0 for t in self.thresholds_mm):
+            raise InputError(f"--thresholds-mm {list(self.thresholds_mm)}; expected positive distances in mm")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a user wants judged, of which it is known that it goes together."""
+
+    run: Path
+    """predictions, a densify run, a map or a trajectory; the folder of several where there is a suite"""
+    source: TruthSource
+    config: JudgingConfig
+    trajectory: Path | None
+    """every localised frame of the maps, in place of their keyframes"""
+    suite: Suite | None = None
+    pairs: Mapping[str, tuple[Path, Path]] = field(default_factory=dict)
+    """what is judged and the folder of its truth, by the name of the sequence"""
+    missing: Mapping[str, str] = field(default_factory=dict)
+    """why a sequence of the suite is not judged, by its name"""
+
+
+def read_asked(
+    run: Path,
+    source: TruthSource,
+    config: JudgingConfig,
+    join: Path | None = None,
+    suite: Path | None = None,
+    trajectory: Path | None = None,
+    in_place: bool = False,
+) -> Asked:
+    """Raises InputError where the options do not go together. `in_place` is whether the metrics go into the run."""
+    truth = source.truth
+    if not run.exists():
+        raise InputError(f"{run}: no such folder or file")
+    if in_place and not is_made_by_us(run):
+        raise InputError(f"{run}: not a folder of this program; add -o FOLDER for the metrics")
+    if truth is None and join is None and not withheld_errors(run):
+        raise InputError(
+            "nothing to evaluate against: give --truth DATA, or --join FILE for the gap between two submaps (only a "
+            "densify run with withheld points has figures without either)"
+        )
+    if suite is not None and (truth is None or trajectory or source.truth_mesh or join):
+        raise InputError("--suite needs --truth, and goes with neither --trajectory, --truth-mesh nor --join")
+    if truth is None:
+        return Asked(run, source, config, trajectory)
+    if suite is None:
+        return Asked(run, source, config, trajectory, pairs={truth.name: (run, truth)})
+    columns = read_suite(shipped(suite))
+    pairs, missing = present(columns, run, truth)
+    return Asked(run, source, config, trajectory, columns, pairs, missing)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Evaluations by the name of the sequence, and what the maps' withheld points say."""
+
+    found: Mapping[str, Evaluation[DepthJudged | MapsJudged]]
+    withheld: Sequence[WithheldOfMap]
+
+
+def judge_asked(asked: Asked, model: DepthModel | None, out: Run) -> Answer:
+    """All that was asked for; sparse maps are made dense with `model` first, and the surfaces written.
+
+    A sequence of a suite that cannot be judged is among the run's failures; InputError is raised when none can, and for
+    a single sequence.
+    """
+    found: dict[str, Evaluation[DepthJudged | MapsJudged]] = {}
+    withheld = [] if asked.suite else withheld_errors(asked.run)
+    for name, reason in asked.missing.items():
+        out.fail(name, reason)
+    for name, (judged, folder) in asked.pairs.items():
+        try:
+            if judged.is_dir() and any(judged.glob("*.npz")):
+                frames = asked.source.sequence(folder).open()
+                found[name] = judge_depth(judged, frames, asked.config.max_depth_mm, asked.config.common)
+                continue
+            frames, maps, points = _maps(asked, name, model, out)
+            withheld += [replace(entry, sequence=name) for entry in points] if asked.suite else points
+            found[name] = _judged_maps(asked, judged, maps, frames)
+        except InputError as error:
+            if asked.suite is None:
+                raise
+            out.fail(name, str(error))
+    if asked.suite and not found:
+        raise InputError(f"no sequence could be judged; the first: {out.record['failures'][0]['reason']}")
+    return Answer(found, withheld)
+
+
+def _maps(
+    asked: Asked, name: str, model: DepthModel | None, out: Run
+) -> tuple[FrameSequence, list[JudgedMap], list[WithheldOfMap]]:
+    """The frames of a sequence, its maps, and what is said of their withheld points where it was not said before."""
+    judged, folder = asked.pairs[name]
+    if model is None or map_folders(judged) or judged.is_file():
+        frames, maps = asked.source.sequence(folder).open(), read_models(judged, asked.trajectory)
+        return frames, maps, withheld_errors(judged) if asked.suite else []
+    sparse_map, frames = map_and_frames(out, asked.source.sequence(folder), judged, SfmConfig())
+    maps, points = _made_dense(frames, sparse_map, model, out.folder / name if asked.suite else out.folder)
+    poses = asked.trajectory or (judged if trajectory_files(judged) else None)
+    return frames, with_trajectories(maps, read_trajectories(poses)) if poses else maps, points
+
+
+def _judged_maps(
+    asked: Asked, judged: Path, maps: Sequence[JudgedMap], frames: FrameSequence
+) -> Evaluation[MapsJudged]:
+    truth = read_truth(frames, asked.source.truth_mesh, with_surface=any(m.clouds for m in maps))
+    if asked.suite and asked.suite.fps:
+        truth = replace(truth, period=1 / asked.suite.fps)
+    unit = 1.0 if asked.config.mm_per_unit is None and in_mm(judged) else asked.config.mm_per_unit
+    return judge_maps(maps, truth, unit, asked.config.thresholds_mm, asked.config.common)
+
+
+def _made_dense(
+    frames: FrameSequence, sparse_map: SparseMap, model: DepthModel, folder: Path
+) -> tuple[list[JudgedMap], list[WithheldOfMap]]:
+    """The maps made dense as `densify` makes them, with its defaults, and written; maps of which no surface was made
+    keep their sparse points. And what is said of the withheld points, with the constant distance's."""
+    work = Densified.make(frames, sparse_map, model, DensifyConfig())
+    constant = {b.dense.submap.id: b.withheld for b in work.baselines}
+    withheld = []
+    for result in work.results:
+        map_id = result.dense.submap.id
+        if len(result.dense.triangles):
+            result.dense.write(folder / f"map_{map_id:03d}")
+        if result.withheld is not None:
+            withheld.append(WithheldOfMap(map_id, result.withheld, constant.get(map_id)))
+    dense = {m.trajectory.id: m for m in (dense_models(read_run(folder)) if map_folders(folder) else [])}
+    return [dense.get(m.trajectory.id, m) for m in sparse_models(sparse_map)], withheld

@@ -1,0 +1,84 @@
+"""Cards in adapting: what is taken from the start's, and what is said in that of the adapted network.
+
+The start's may be of any age, so that what it holds is checked where it is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from lightdepth.errors import InputError
+from lightdepth.losses import LossConfig
+
+from ..card import Card
+from ..colons import TubeData
+from .judging import Verdict
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptedCard(Card):
+    """The card of an adapted checkpoint."""
+
+    adapted_from: str
+    """name of the checkpoint that it started from"""
+    tube: object
+    """the colons that the start was trained on, as its card says"""
+    replayed: TubeData | None
+    """the colons that were replayed, if any"""
+    frames: Mapping[str, int]
+    """number of frames that it learned from, and that were held out"""
+    verdict: Verdict
+    """start and adapted network side by side"""
+
+    def record(self) -> dict[str, object]:
+        shared = super().record()
+        said, errors, version = shared.pop("trained_on"), shared.pop("errors"), shared.pop("version")
+        return {
+            "trained_on": said,
+            "adapted_from": self.adapted_from,
+            **shared,
+            "tube": self.tube,
+            "replayed": None if self.replayed is None else asdict(self.replayed),
+            "frames": dict(self.frames),
+            "errors": errors,
+            "verdict": str(self.verdict),
+            "version": version,
+        }
+
+
+def target_loss(card: dict[str, Any], reflectance_known: bool, replayed: bool) -> LossConfig:
+    """The loss of a checkpoint's card (the defaults without one), fit for frames without truth: free of gain.
+
+    Terms with truth stay for replayed colons only. Where the card takes each image's calibrated reflectance and the
+    target's is not known, it is the default's.
+    """
+    default = LossConfig()
+    try:
+        own = LossConfig(**card.get("loss", {}))
+    except TypeError as error:
+        raise InputError(f"the checkpoint's card has a loss that is not known here ({error})") from error
+    reflectance = own.reflectance
+    if reflectance is None and not reflectance_known:
+        reflectance = default.reflectance
+    return replace(
+        own,
+        gain="free",
+        reflectance=reflectance,
+        photometric=own.photometric or default.photometric,
+        self_supervised=own.self_supervised or default.self_supervised,
+        supervised=own.supervised if replayed else 0.0,
+        uncertainty=0.0,
+    )
+
+
+def source_colons(card: dict[str, Any], scenes: int) -> TubeData:
+    """So many colons of the kind that a checkpoint's card says it was trained on; of the default kind without one."""
+    own = card.get("tube") or {}
+    known: dict[str, Any] = {
+        name: tuple(own[name]) if isinstance(own[name], list) else own[name]
+        for name in ("frames", "travel", "lenses", "mu", "gamma", "reflectance", "family")
+        if name in own
+    }
+    return TubeData(scenes=scenes, **known)

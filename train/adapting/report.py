@@ -1,0 +1,97 @@
+"""The page of an adapted network: start and adapted network side by side, in numbers and in pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lightdepth.frame import Frame
+from lightdepth.models import DeclineModel, DepthModel, NetworkModel
+from lightdepth.prediction import DepthPrediction
+from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
+from lightdepth.reporting.report import Report
+
+from .judging import Outcome
+from .module import Adaptation
+from .target import Target, light_text
+
+_SHOWN = 4
+
+
+class Pictures:
+    """Held-out frames spread over time, and what each of several models says of them."""
+
+    def __init__(self, target: Target) -> None:
+        held = target.held
+        self._frames = [held[i] for i in sorted({round(k * (len(held) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)})]
+        self._said: list[list[DepthPrediction]] = [[] for _ in self._frames]
+        self.add(DeclineModel(details=False))
+
+    def add(self, model: DepthModel) -> None:
+        """Adds what a model says as it is now."""
+        for frame, row in zip(self._frames, self._said, strict=True):
+            row.append(model(frame))
+
+    def rows(self) -> list[tuple[bytes, str]]:
+        """PNG and caption for each frame: closed form, start and adapted network."""
+        return [_picture(frame, row) for frame, row in zip(self._frames, self._said, strict=True)]
+
+
+def _picture(frame: Frame, predictions: Sequence[DepthPrediction]) -> tuple[bytes, str]:
+    maps = [(p.distance, p.valid) for p in predictions]
+    names = "image, closed form, start, adapted"
+    if frame.true_distance is not None:
+        maps.append((frame.true_distance, frame.valid & (frame.true_distance > 0)))
+        names += ", truth"
+    pictures = [thumbnail(picture, 240) for picture in (frame.image, *(colored_distance(*m) for m in maps))]
+    return png(side_by_side(pictures)), f"{frame.name}: {names}"
+
+
+def page(
+    target: Target, start: NetworkModel, module: Adaptation, outcome: Outcome, held: int, fitted: str | None
+) -> Report:
+    """What was adapted and what it came to; `fitted` says what was found where the light was fitted on the map."""
+    page = Report(f"{start.name} adapted to {target.source.data}")
+    kept = (
+        "The model was written."
+        if outcome.written
+        else "The model got worse, so none was written; --keep-worse writes it."
+    )
+    page.text(f"{outcome.verdict}. {kept}")
+    if outcome.verdict.criterion == "label_free":
+        page.text(
+            "Neither truth nor a map was there to judge by: the loss says how well the light explains the images, not "
+            "how right the distance is. It can fall while distance gets worse; a sparse map (--map) tells."
+        )
+    page.text(f"Light of the frames: {light_text(target.light)}." + (f" Light {fitted}." if fitted else ""))
+    page.heading(f"Before and after, on {held} frames that were held out")
+    headers = ["model"]
+    columns: list[list[float | None]] = []
+    before, after = outcome.before, outcome.after
+    if "abs_rel_median" in before.errors:
+        titles = {"abs_rel": "AbsRel", "rmse_mm": "RMSE mm", "medae_mm": "MedAE mm", "delta1": "share within 1.25"}
+        for name, title in titles.items():
+            headers.append(f"{title} (median-aligned)")
+            keys = (f"closed_form/{name}_median", f"{name}_median", f"{name}_median")
+            columns.append([e.errors[key] for e, key in zip((before, before, after), keys, strict=True)])
+    if before.at_points is not None:
+        headers.append("median error at the map's points")
+        columns.append([outcome.closed_form_at_points, before.at_points, after.at_points])
+    for name, title in (("loss", "self-supervised loss"), ("inconsistency", "inconsistency")):
+        headers.append(title)
+        columns.append([None, before.errors[name], after.errors[name]])
+    names = ("closed form", f"start: {start.name}", "adapted")
+    page.table(headers, [[name, *row] for name, row in zip(names, zip(*columns, strict=True), strict=True)])
+    page.text(
+        f"{module.learning} weights learned; anchor {module.anchor:g}, "
+        f"{'half of each batch replayed' if module.replay else 'no replay'}; the map "
+        f"{_taught_said(module)}. Inconsistency: how much distance changes "
+        "in a mirror and in less light. Pictures: the image, and distance by closed form, start and adapted network, "
+        "then truth where there is any, each with its own range of colours, near in yellow."
+    )
+    return page
+
+
+def _taught_said(module: Adaptation) -> str:
+    if module.teacher is None:
+        return "taught nothing"
+    return "taught with weights " + ", ".join(f"{value:g} ({name})" for name, value in module.map_weights.items())

@@ -1,0 +1,155 @@
+"""What is adapted to: frames of another endoscope or organ, their light, and the map that teaches and judges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from lightdepth.calibration import write_camera, write_light
+from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets.pairing import check_shared_frames
+from lightdepth.errors import InputError
+from lightdepth.light.fit_on_map import LightView, fit_assumed_light, with_light
+from lightdepth.losses import LossConfig
+from lightdepth.maps import read_map
+from lightdepth.models import NetworkModel
+from lightdepth.photometry import PhotometricCalibration
+from lightdepth.reporting.run import Run
+from lightdepth.sparse_map import SparseMap
+
+from ..datamodule import FrameData, FrameDataModule
+from .card import source_colons
+from .config import AdaptConfig
+from .judging import LEAST_VIEWS, parted
+from .map_teacher import MapTeacher
+from .module import Adaptation
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The sequence that a network is adapted to."""
+
+    source: SequenceSource
+    """where its frames are, with the camera and the light that were found for them"""
+    frames: FrameSequence
+    """all of its frames"""
+    training: FrameSequence
+    """the frames to learn from"""
+    held: FrameSequence
+    """the frames at its end, which judge and are never learned from"""
+    sparse_map: SparseMap | None
+    """a map of it, where one was given"""
+
+    @property
+    def light(self) -> PhotometricCalibration:
+        return self.frames[0].light
+
+
+def read_target(
+    run: Run, source: SequenceSource, map: Path | None, fit_light: bool, held_out: float, start: NetworkModel
+) -> Target:
+    """The frames and their map. Where nobody gave a light, the map's points may tell it; what was used is written."""
+    sparse_map = read_map(map) if map is not None else None
+    map_camera = sparse_map.submaps[0].keyframes[0].camera if sparse_map is not None else None
+    frames = source.open(map_camera)
+    run.hash_inputs(**source.files, map=map)
+    training, held = parted(frames, held_out)
+    if sparse_map is not None:
+        check_shared_frames(sparse_map, frames)
+        write_camera(frames[0].camera, run.folder / "camera.json")
+        # The map's camera, where the folder has none: for all sequences.
+        source = replace(source, camera=run.folder / "camera.json")
+        if source.light is None and fit_light:
+            fitted = fit_assumed_light(run, training, sparse_map, start)
+            if fitted is not None:
+                frames, training, held = (with_light(part, fitted) for part in (frames, training, held))
+                source = replace(source, light=str(run.folder / "light.json"))
+    write_light(frames[0].light, run.folder / "light.json")
+    run.log(f"light of {source.data}: {light_text(frames[0].light)}")
+    return Target(source, frames, training, held, sparse_map)
+
+
+def light_text(light: PhotometricCalibration) -> str:
+    """A light in a few words."""
+    return f"gamma {light.gamma:.3g}, mu {light.mu:.3g}, reflectance {light.reflectance:.3g} ({light.source})"
+
+
+def frame_data(
+    run: Run, target: Target, more: Sequence[Path], config: AdaptConfig, size: tuple[int, int], start: NetworkModel
+) -> FrameDataModule:
+    """Frames of the target and of other sequences like it, with the colons that are replayed."""
+    source = target.source
+    data = FrameDataModule(
+        FrameData(
+            [str(path) for path in (source.data, *more)],
+            format=source.format,
+            camera=None if source.camera is None else str(source.camera),
+            light=source.light,
+            mask=None if source.mask is None else str(source.mask),
+            held_out=config.held_out,
+            tube=source_colons(start.card, config.replay),
+            halves=config.replay > 0,
+            size=size,
+            batch_size=config.batch_size,
+            seed=config.seed,
+        )
+    )
+    data.setup()
+    replayed = replayed_frames(data)
+    colons = f"; {replayed} frames of {config.replay} synthetic colons in half of each batch" if config.replay else ""
+    learned = data.counts["train"] - replayed
+    run.log(f"{learned} frames to learn from, {data.counts['val']} held out, {size[0]}x{size[1]}{colons}")
+    return data
+
+
+def replayed_frames(data: FrameDataModule) -> int:
+    """How many of the frames to learn from are of replayed colons."""
+    return data.tube.scenes * data.tube.frames
+
+
+def adaptation(
+    run: Run,
+    target: Target,
+    start: NetworkModel,
+    loss: LossConfig,
+    views: Sequence[LightView],
+    config: AdaptConfig,
+    size: tuple[int, int],
+) -> Adaptation:
+    """The start, as a module that goes on learning from the target; `views` of its map judge."""
+    teacher = None
+    if target.sparse_map is not None and config.taught:
+        teacher = _teacher(run, target, target.sparse_map, views, size, config.seed)
+    return Adaptation(
+        start,
+        loss,
+        config.learning_rate,
+        size[1],
+        config.anchor,
+        config.replay > 0,
+        config.what,
+        config.rank,
+        torch.Generator().manual_seed(config.seed),
+        teacher,
+        {"points": config.points, "overlap": config.overlap},
+    )
+
+
+def _teacher(
+    run: Run, target: Target, sparse_map: SparseMap, views: Sequence[LightView], size: tuple[int, int], seed: int
+) -> MapTeacher:
+    """The map as a teacher that keeps quiet about what judges."""
+    judges = {view.keyframe.number for view in views}
+    if not judges <= set(target.held.numbers):
+        raise InputError(
+            f"{sparse_map.source}: too few of its keyframes are held-out frames to judge what the others teach; "
+            f"{LEAST_VIEWS} are needed: raise --held-out, or leave --points and --overlap at 0"
+        )
+    teacher = MapTeacher(target.training, sparse_map, size, target.held.numbers, seed)
+    known = sum(len(k.distances) for k in teacher.keyframes)
+    paired = sum(bool(k.partners) for k in teacher.keyframes)
+    run.log(f"the map teaches: {len(teacher.keyframes)} keyframes, {known} observed points, {paired} with partners")
+    return teacher
