@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from densify.similarity import Similarity as Similarity
     from densify.similarity import fit_similarity as fit_similarity
 
-from lightdepth import __version__ as __version__
-
 _HOMES = {
     "Alignment": "densify.alignment",
     "DenseMap": "densify.dense_map",

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, cast
 if TYPE_CHECKING:
     from importlib.abc import Loader, MetaPathFinder
 
-MOVED: dict[str, str] = {}
+MOVED: dict[str, str] = {"lightdepth.predict": "lightdepth.models"}
 """Old name of a module -> new name."""
 
 
