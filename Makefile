@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= runs/demo
 export OMP_WAIT_POLICY = passive
 
-.PHONY: setup demo test test-slow lint format bench same ablation clean
+.PHONY: setup demo test test-slow coverage lint format bench same ablation clean
 
 setup: $(VENV)/.ready
 
@@ -23,6 +23,10 @@ test: setup
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow
+
+# Numba off, so that lines of compiled loops count; far slower than test. The floor stands in pyproject.toml.
+coverage: setup
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --cov --cov-report=term:skip-covered
 
 lint: setup
 	$(BIN)/ruff check .

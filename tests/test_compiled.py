@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
+import pytest
 from numba.core.caching import CacheImpl
 
 from densify.fusion.compiled import compiled
@@ -15,6 +17,7 @@ def twice(values):
     return out
 
 
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="Numba is off, to count lines")
 def test_machine_code_is_kept_beside_the_source_or_where_the_user_wants_it(tmp_path, monkeypatch):
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
     assert compiled(twice)(np.arange(3)).tolist() == [0, 2, 4]

@@ -112,3 +112,12 @@ def test_the_version_stands_in_one_place_and_the_others_agree():
     assert headings[0] == "## [Unreleased]"
     assert not headings[1:] or headings[1].startswith(f"## [{here}] - ")
     assert f'"{here}"' not in (ROOT / "pyproject.toml").read_text()
+
+
+def test_the_hooks_before_a_commit_use_the_versions_of_the_constraints():
+    import yaml
+
+    constraints = (ROOT / "constraints.txt").read_text().splitlines()
+    (repo,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    for hook in repo["hooks"]:
+        assert set(hook["additional_dependencies"]) <= set(constraints)
