@@ -85,17 +85,12 @@ def install(moved: Mapping[str, str] = MOVED) -> None:
 
 
 def names_of(package: str, home: str) -> Callable[[str], object]:
-    """`__getattr__` of a package that was a module: the names that stood in it are those of its new home."""
+    """`__getattr__` of a package that was a module: the names that stood in it are those of its new home, silently."""
 
     def __getattr__(name: str) -> object:
         if name.startswith("__"):
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        found = getattr(import_module(home), name)
-        warnings.warn(
-            f"{package}.{name} is now {home}.{name}; the old name goes with the next release",
-            DeprecationWarning,
-            stacklevel=2,
-        )
+        found: object = getattr(import_module(home), name)
         return found
 
     return __getattr__

@@ -1,0 +1,118 @@
+"""The README's commands: every one is understood, and all that take seconds on a small colon are run, in order."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from colons import colon, slam
+
+from lightdepth.camera import Pinhole
+from lightdepth.cli import GROUP, main, verb_parser
+from lightdepth.parsing import parsed
+from lightdepth.presets import with_preset
+from lightdepth.tube.export import write_synthetic
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+BLOCKS = re.split(r"^```.*$", README, flags=re.MULTILINE)[1::2]
+COMMANDS = [line for block in BLOCKS for line in block.splitlines() if line.startswith("lightdepth ")]
+MINUTES = ("bench", "ablate", "train --preset lightdepth", "train --preset tube_smoke -o runs/real")
+"""Commands that take minutes: what they do is tested in modules of their own."""
+OTHER_DATA = ("--suite", "calib_results.txt", "--join", "joined_000")
+"""Commands on data that the colon does not give; likewise."""
+
+PLACES = {
+    "FRAMES": "data",
+    "OTHERS": "data",
+    "SEQUENCE": "data",
+    "VIDEO": "data",
+    "MAP": "data/slam",
+    "DATA": "made",
+    "REPORT": "report",
+    "PREDICTIONS": "predictions",
+    "[B, C]": "[data]",
+}
+QUICK = {
+    "train": "--trainer.max_steps 2 --trainer.val_check_interval 2 --data.tube.scenes 1 --data.tube.val_scenes 1 "
+    "--data.tube.frames 4 --data.size [48,40]",
+    "adapt": "--steps 2 --size [48,40] --held-out 0.4",
+    "synth": "--frames 8 --size [64,52] --slam.maps 1 --slam.keyframe_every 1",
+}
+
+
+def words_of(command: str) -> list[str]:
+    return shlex.split(command, comments=True)[1:]
+
+
+def test_the_readme_shows_every_verb():
+    shown = {words_of(command)[0] for command in COMMANDS} | set(re.findall(r"`lightdepth ([a-z-]+)", README))
+    told = re.findall(r"lightdepth ([a-z-]+)", README)
+    verbs = {entry.name for entry in metadata.entry_points(group=GROUP)}
+    assert len(COMMANDS) > 40 and verbs <= shown | set(told)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_of_the_readme_is_understood(command):
+    verb, *words = words_of(command)
+    (entry,) = metadata.entry_points(group=GROUP, name=verb)
+    if verb in ("bench", "train"):  # which parse their own words
+        if verb == "train":
+            from train.cli import training_parser
+
+            parser = training_parser()
+        else:
+            from densify.commands import bench
+
+            name = words.pop(0) if words[0] in ("compare", "estimators") else ""
+            function = {"compare": bench.compare_runs, "estimators": bench.compare_estimators}.get(name, bench.run)
+            parser = verb_parser(function, f"bench {name}".strip())
+    else:
+        parser = verb_parser(entry.load(), verb)
+    assert parsed(parser, with_preset(verb, words, parser.error)) is not None
+
+
+def test_the_commands_that_take_seconds_run_as_they_stand(tmp_path, monkeypatch):
+    frames = colon(0, 12).frames
+    write_synthetic(frames, slam(frames), tmp_path / "data")
+    camera = frames[0].camera
+    assert isinstance(camera, Pinhole)
+    monkeypatch.chdir(tmp_path)
+    assert main(["predict", "data", "-o", "predictions", "--checkpoint", "decline", "--previews", "false"]) == 0
+    made = {"name": "camera.json", "model": "PINHOLE", "width": camera.width, "height": camera.height}
+    shown = {**made, "params": [camera.fx, camera.fy, camera.cx, camera.cy]}
+    Path("camera.json").write_text(json.dumps({key: value for key, value in shown.items() if key != "name"}))
+    run = [c for c in COMMANDS if not any(word in c for word in (*OTHER_DATA, *(f"lightdepth {m}" for m in MINUTES)))]
+    assert len(run) > 25
+    for command in run:
+        verb, *words = words_of(_on_the_colon(command))
+        words += QUICK.get(verb, "").split()
+        if "-o" in words:
+            words += ["--overwrite"]
+        assert main([verb, *words]) == 0, command
+
+
+def _on_the_colon(command: str) -> str:
+    """The command with the colon's folders and places in place of the reader's."""
+    for word, place in PLACES.items():
+        command = re.sub(rf"(?<![\w/]){re.escape(word)}(?![\w/])", place, command)
+    command = command.replace("--start 60 --end 300", "--start 0 --end 0.3").replace("--frame 120", "--frame 5")
+    pixels = re.search(r"--pixels '(.*?)'", command)
+    if pixels:
+        count = pixels[1].count("[") - 1
+        command = command.replace(pixels[1], str([[40, 30], [60, 35], [45, 50]][:count]))
+    points = re.search(r"--points '(\[\[.*?\]\])'", command)
+    if points:
+        command = command.replace(points[1], str(_places(points[1].count("x"))))
+    return command
+
+
+def _places(count: int) -> list[list[float]]:
+    """Vertices of the densified colon, far from its rim."""
+    from densify import read_dense_map
+
+    vertices = read_dense_map("runs/dense/map_000").vertices
+    return vertices[[len(vertices) // 2, len(vertices) // 3][:count]].tolist()
