@@ -87,10 +87,13 @@ class Asked:
     run: Path
     """predictions, a densify run, a map or a trajectory; the folder of several where there is a suite"""
     source: TruthSource
+    """what is judged against"""
     config: JudgingConfig
+    """how errors are taken"""
     trajectory: Path | None
     """every localised frame of the maps, in place of their keyframes"""
     suite: Suite | None = None
+    """which sequences stand in one table; None for a single one"""
     pairs: Mapping[str, tuple[Path, Path]] = field(default_factory=dict)
     """what is judged and the folder of its truth, by the name of the sequence"""
     missing: Mapping[str, str] = field(default_factory=dict)
@@ -130,10 +133,12 @@ def read_asked(
 
 @dataclass(frozen=True)
 class Answer:
-    """Evaluations by the name of the sequence, and what the maps' withheld points say."""
+    """What all that was asked for gave."""
 
     found: Mapping[str, Evaluation[DepthJudged | MapsJudged]]
+    """by the name of the sequence"""
     withheld: Sequence[WithheldOfMap]
+    """what the maps' withheld points say"""
 
 
 def judge_asked(asked: Asked, model: DepthModel | None, out: Run) -> Answer:

@@ -101,7 +101,8 @@ def test_a_joined_surface_is_judged_by_its_own_folder(judged, run, data, tmp_pat
 
 
 def test_withheld_points_are_in_every_report_with_a_constant_distance_beside(judged, run, data, tmp_path):
-    assert metrics(judged)["withheld"][0]["withheld_constant"]["median"] == 0.3
+    (told,) = json.loads((run / "run.json").read_text())["maps"]
+    assert metrics(judged)["withheld"] == [told] and told["withheld_constant"]["median"] == 0.3
     text = (judged / "metrics.md").read_text()
     assert "| map 0 | this depth | 40 | 0.03 | ∞ | 0.1 |" in text
     assert "| map 0 | constant distance | 40 | 0.3 | ∞ | 0.1 |" in text
@@ -362,3 +363,8 @@ def test_options_that_mean_nothing_are_refused(run, data, tmp_path):
             evaluate(run, data, tmp_path / "out", **options)
     with pytest.raises(InputError, match="no such folder or file"):
         evaluate(run / "nowhere", data)
+    (tmp_path / "dense").mkdir()
+    (tmp_path / "dense" / "run.json").write_text('{"maps": [{"map": 0, "withheld": {"points": 40, "median": 0.1}}]}')
+    with pytest.raises(InputError) as caught:
+        evaluate(tmp_path / "dense", None, tmp_path / "out")
+    assert "run.json: maps: withheld.p90 missing" in str(caught.value)

@@ -30,8 +30,11 @@ class DistanceFigures:
     """Distances in three numbers [mm]."""
 
     rms_mm: float
+    """root of the mean square"""
     median_mm: float
+    """half of the distances are below it"""
     p90_mm: float
+    """nine tenths of the distances are below it"""
 
     @classmethod
     def of(cls, distance: np.ndarray) -> DistanceFigures:
@@ -42,12 +45,16 @@ class DistanceFigures:
 
 @dataclass(frozen=True)
 class SurfaceFigures:
-    """Errors of a model's points: rms_mm, median_mm and p90_mm are of their distances to the closest true point."""
+    """Errors of a model's points, without any cap."""
 
     points: int
+    """number of the model's points"""
     rms_mm: float
+    """root mean square distance from the model's points to the closest true point (accuracy)"""
     median_mm: float
+    """median of these distances"""
     p90_mm: float
+    """90th percentile of these distances"""
     to_mesh: DistanceFigures | None
     """from the model's points to the true mesh, where there is one"""
     completeness: DistanceFigures
@@ -65,9 +72,13 @@ class Gap:
     """|d1 - d2| / d1 along common rays, d the distances from the camera to two surfaces."""
 
     rays: int
+    """number of rays that meet both surfaces"""
     median: float
+    """median over these rays"""
     p90: float
+    """90th percentile over these rays"""
     both_share: float
+    """share of the rays that meet either surface which meet both"""
 
 
 @dataclass(frozen=True)
@@ -75,8 +86,11 @@ class MapGap:
     """The gap between two maps of a run, by their ids."""
 
     first: int
+    """id of the map whose cameras cast the rays"""
     second: int
+    """id of the map that is brought to it"""
     gap: Gap
+    """flat in the file"""
 
     def record(self) -> dict[str, Any]:
         unit = "share of the distance to the camera"
@@ -91,6 +105,7 @@ class AlignedFigures:
     """One submap's trajectory after its alignment."""
 
     poses: int
+    """number of its poses that have a true one"""
     rms_ate_mm: float
     """after Sim(3)"""
     rms_ate_se3_mm: float | None
@@ -106,21 +121,31 @@ class TrajectoryFigures:
     """All submaps' trajectories together, out of the sequence's frames."""
 
     frames: int
+    """number of the sequence's frames"""
     frames_localised: int | None
-    """None where the trajectories hold keyframes alone"""
+    """number of frames with a pose in any submap; None where the trajectories hold keyframes alone"""
     localised_share: float | None
+    """share of the sequence's frames that they are"""
     localised_of: str
+    """what the share is of, or why it is not known"""
     keyframes: int
+    """number of frames that are a keyframe of any submap"""
     submaps: int
+    """number of submaps"""
     submaps_aligned: int
+    """number of submaps that could be aligned"""
     poses: int
+    """number of poses that have a true one, of all aligned submaps"""
     rms_ate_mm: float
     """over all poses, each after its own submap's Sim(3)"""
     rms_ate_se3_mm: float | None
+    """over all poses, each after its own submap's SE(3); None where the scale of no map is known"""
     climb_ate_mm: float | None
-    """CLiMB's mean of the submaps', weighted by their poses"""
+    """CLiMB's mean of the submaps', weighted by their poses; None where no submap has enough"""
     climb_submaps: int
+    """number of submaps that CLiMB counts"""
     climb_rule: str
+    """which submaps CLiMB counts, and how"""
     ms_per_keyframe: float | None = None
     """time that the recording leaves for each keyframe"""
 
@@ -130,15 +155,17 @@ class MapFigures:
     """One submap: its figures, or why it has none. Flat in the file."""
 
     map_id: int
-    """"map" in the file"""
+    """id of the submap; `map` in the file"""
     keyframes: int
+    """number of its keyframes"""
     error: str = ""
     """why its trajectory could not be aligned; not in the file where it could"""
     aligned: AlignedFigures | None = None
+    """None where it could not; flat in the file"""
     surface_error: str = ""
     """why its surface cannot be compared; not in the file where it can"""
     clouds: Mapping[str, SurfaceFigures | None] = field(default_factory=dict)
-    """by the name of the point cloud; None for a cloud without points"""
+    """by the name of the point cloud; None for a cloud without points; flat in the file"""
 
     def alone(self) -> dict[str, Any]:
         """The figures that are of no cloud."""
@@ -156,12 +183,17 @@ class TruthFigures:
     """What maps were judged against."""
 
     frames: int
+    """number of the sequence's frames"""
     poses: int
+    """number of frames that have a true pose"""
     cloud: str
     """how the true cloud was sampled, or why there is none"""
     cloud_points: int | None
+    """number of its points"""
     cloud_spacing_mm: float | None
+    """median distance between neighbouring points"""
     mesh: str | None
+    """where the true mesh is from"""
 
 
 @dataclass(frozen=True)
@@ -169,11 +201,15 @@ class MapsJudged:
     """Submaps against a sequence with true poses: each, and all together."""
 
     truth: TruthFigures
+    """what they were judged against"""
     thresholds_mm: Sequence[float]
+    """distances of precision, recall and F-score"""
     trajectory: TrajectoryFigures
+    """of all submaps together"""
     pooled: Mapping[str, SurfaceFigures]
-    """"all" in the file: the clouds of the submaps together, by name"""
+    """the clouds of the submaps together, by name; `all` in the file"""
     maps: Sequence[MapFigures]
+    """each submap, in the order given"""
 
     alignment = "Sim(3) of each submap's trajectory to the true one (least ATE); SE(3) where the map is in mm"
     mask = (
@@ -207,6 +243,7 @@ class DepthFigures:
     pixels: float
     """number of pixels that were compared"""
     share_of_image: float
+    """share of the image that was compared"""
     share_of_truth: float
     """share of the valid truth that was compared"""
 
@@ -234,12 +271,17 @@ class DepthJudged:
     """Predictions against a sequence with true depth: each frame, and their mean."""
 
     predicted_unit: str
+    """unit of the predictions; several are parted by commas"""
     alignment: Mapping[str, str]
     """what each alignment does, by its name"""
     max_depth_mm: float
+    """true depth from which on a pixel takes no part"""
     frames_of_truth: int
+    """number of the sequence's frames"""
     frames_predicted: int
+    """number of predictions"""
     mean: DepthFigures
+    """over the frames that were judged"""
     frames: Mapping[str, DepthFigures]
     """by the name of the prediction"""
     skipped: Mapping[str, str]
@@ -285,12 +327,16 @@ Judged = TypeVar("Judged", bound="DepthJudged | MapsJudged", covariant=True)
 
 @dataclass(frozen=True)
 class ErrorMesh:
-    """A surface in the true world [mm] with the distance (n,) [mm] of each vertex from the true cloud."""
+    """A surface in the true world with the distance of each vertex from the true cloud."""
 
     name: str
+    """how its files begin"""
     vertices: np.ndarray
+    """(n, 3) [mm]"""
     triangles: np.ndarray
+    """(m, 3) indices of vertices"""
     distance: np.ndarray
+    """(n,) [mm]"""
 
 
 @dataclass(frozen=True)
@@ -298,6 +344,7 @@ class Evaluation(Generic[Judged]):
     """Figures, and what their pictures are drawn from."""
 
     judged: Judged
+    """the figures"""
     curves: Mapping[str, np.ndarray] = field(default_factory=dict)
     """shares of the errors within EDGES_MM, by name"""
     meshes: Sequence[ErrorMesh] = ()
@@ -313,9 +360,11 @@ class Sources:
     """What a user gave to be judged, and the gap between two submaps where it was asked for."""
 
     run: Path
+    """what was judged"""
     truth: Path | None
-    """"truth_folder" in the file"""
+    """what it was judged against; `truth_folder` in the file"""
     gap: MapGap | None = None
+    """not in the file where it was not asked for"""
 
     def record(self) -> dict[str, Any]:
         gap = {} if self.gap is None else {"gap": plain(self.gap.record())}

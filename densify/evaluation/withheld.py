@@ -56,8 +56,11 @@ class WithheldOfMap:
     """The withheld points of one map, with a constant distance's beside."""
 
     map_id: int
+    """id of the map; `map` in the file"""
     withheld: Withheld
+    """by the depth that the map was made with"""
     constant: Withheld | None = None
+    """by a constant distance; `withheld_constant` in the file"""
     sequence: str = ""
     """which sequence the map is of, where several are judged"""
 
