@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import yaml
 
 from lightdepth import gone_settings
 from lightdepth.cli import main, parse
+from lightdepth.options import groups_of
 from lightdepth.presets import FOLDERS, preset_help, presets, shipped, with_preset
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -131,4 +133,6 @@ def test_settings_that_are_gone_are_no_options_of_today():
 
     for name, keys in gone_settings.GONE_SETTINGS.items():
         (entry,) = metadata.entry_points(group="lightdepth.commands", name=name)
-        assert not set(keys) & set(inspect.signature(entry.load()).parameters)
+        run = entry.load()
+        fields = {f.name for group in groups_of(run).values() for f in dataclasses.fields(group)}
+        assert not set(keys) & (fields | (set(inspect.signature(run).parameters) - set(groups_of(run))))
