@@ -28,10 +28,10 @@ from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.evaluation.truth import read_truth
 from densify.evaluation.withheld import WithheldOfMap, withheld_errors
 from densify.inputs import check_unit, map_and_frames
+from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.models import DepthModel
-from lightdepth.presets import shipped
 from lightdepth.reporting.run import Run
 from lightdepth.sfm.reconstruction import SfmConfig
 from lightdepth.sparse_map import SparseMap

@@ -14,14 +14,14 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lightdepth.pages import PAGES, Page
+from lightdepth.command_line.pages import PAGES, Page
 
 if TYPE_CHECKING:
-    from lightdepth.parsing import Parser
+    from lightdepth.command_line.parsing import Parser
 
 from lightdepth import __version__
+from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.errors import InputError, PartialFailure
-from lightdepth.own_packages import own_packages_first
 
 GROUP = "lightdepth.commands"
 ORDER = (
@@ -86,10 +86,10 @@ def main(argv: list[str] | None = None) -> int:
 
 def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
-    from lightdepth.gone_settings import without_gone
-    from lightdepth.options import with_groups
-    from lightdepth.parsing import parsed
-    from lightdepth.presets import with_preset
+    from lightdepth.command_line.gone_settings import without_gone
+    from lightdepth.command_line.options import with_groups
+    from lightdepth.command_line.parsing import parsed
+    from lightdepth.command_line.presets import with_preset
 
     parser = verb_parser(function, verb)
     argv = without_gone(verb, with_preset(verb, argv, parser.error))
@@ -100,9 +100,9 @@ def verb_parser(function: Any, verb: str) -> Parser:
     """The options of a verb: the parameters of its function."""
     from docstring_parser import parse as parse_docstring
 
-    from lightdepth.options import add_groups, groups_of
-    from lightdepth.parsing import Parser, finish
-    from lightdepth.presets import preset_help, presets
+    from lightdepth.command_line.options import add_groups, groups_of
+    from lightdepth.command_line.parsing import Parser, finish
+    from lightdepth.command_line.presets import preset_help, presets
 
     said = {p.arg_name: p.description for p in parse_docstring(inspect.getdoc(function) or "").params}
     # The first line only: jsonargparse shows the rest of the docstring beside the options.

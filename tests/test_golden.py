@@ -21,8 +21,8 @@ import yaml
 from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import load_model, read_card
 from lightdepth.cli import main, parse
+from lightdepth.command_line.gone_settings import without_gone
 from lightdepth.frame import Frame
-from lightdepth.gone_settings import without_gone
 from lightdepth.models import predict
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -13,6 +13,7 @@ from videos import CAMERA, OCTAGON, picture, uneven_times, write_video
 
 from lightdepth.calibration import write_camera
 from lightdepth.cli import main, verb_parser
+from lightdepth.command_line.parsing import spelled
 from lightdepth.commands.import_frames import import_frames as import_frames_verb
 from lightdepth.datasets import FrameSequence, VideoFile, open_sequence, write_folder
 from lightdepth.datasets.sequence import border_mask
@@ -22,7 +23,6 @@ from lightdepth.image_quality import Measures, Meter, one_field
 from lightdepth.importing.overlay import find_overlay
 from lightdepth.importing.selection import BLURRED, FROZEN, KEPT, PASSED, UNREADABLE, Choice, selected
 from lightdepth.models import DeclineModel, predict
-from lightdepth.parsing import spelled
 
 import_frames = by_options(import_frames_verb)
 

@@ -18,9 +18,9 @@ from typing import get_args, get_origin
 import pytest
 
 from lightdepth.cli import GROUP, main, verb_parser
+from lightdepth.command_line.pages import PAGES
+from lightdepth.command_line.parsing import Parser, options, parsed
 from lightdepth.datasets import FORMATS, FormatName
-from lightdepth.pages import PAGES
-from lightdepth.parsing import Parser, options, parsed
 
 UNIT = re.compile(
     r"\b(mm|millimetres|milliseconds|seconds|pixels|voxels|degrees|radians|megabytes|map units|map unit|turns of the"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lightdepth.own_packages import own_packages_first
+from lightdepth.command_line.own_packages import own_packages_first
 
 HOME = Path(__file__).resolve().parents[1]
 SCRIPT = [str(Path(sys.executable).with_name("lightdepth"))]
@@ -59,7 +59,7 @@ def test_loader_workers_that_are_spawned_find_our_packages(folder):
     program = (
         "import multiprocessing\n"
         "from importlib.util import find_spec\n"
-        "from lightdepth.own_packages import own_packages_first\n"
+        "from lightdepth.command_line.own_packages import own_packages_first\n"
         "own_packages_first()\n"
         "with multiprocessing.get_context('spawn').Pool(1) as pool:\n"
         "    print(pool.apply(find_spec, ('train',)).origin)\n"

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from lightdepth import gone_settings
 from lightdepth.cli import main, parse
-from lightdepth.options import groups_of
-from lightdepth.presets import FOLDERS, preset_help, presets, shipped, with_preset
+from lightdepth.command_line import gone_settings
+from lightdepth.command_line.options import groups_of
+from lightdepth.command_line.presets import FOLDERS, preset_help, presets, shipped, with_preset
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -34,7 +34,7 @@ def configs(monkeypatch, tmp_path) -> Path:
     """A folder of presets for the verb above, which is called `try`."""
     (tmp_path / "try").mkdir()
     (tmp_path / "try" / "first.yaml").write_text("number: 1\nmany: [1, 2]\ndata: preset\n")
-    monkeypatch.setattr("lightdepth.presets._CONFIGS", tmp_path)
+    monkeypatch.setattr("lightdepth.command_line.presets._CONFIGS", tmp_path)
     monkeypatch.setitem(FOLDERS, "try", "try")
     return tmp_path
 

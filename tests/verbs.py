@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import MISSING, fields
 from typing import Any
 
-from lightdepth.options import groups_of, with_groups
+from lightdepth.command_line.options import groups_of, with_groups
 
 
 def by_options(verb: Callable[..., Any]) -> Callable[..., Any]:

@@ -7,14 +7,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lightdepth.pages import PAGES
+from lightdepth.command_line.pages import PAGES
 
 from .trainer_options import TRAINER_OPTIONS
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-    from lightdepth.parsing import Parser
+    from lightdepth.command_line.parsing import Parser
 
 TRAINER_DEFAULTS = {
     "trainer.max_steps": 1500,
@@ -35,9 +35,9 @@ def train(argv: list[str] | None = None) -> int:
     """
     import lightning.pytorch as pl
 
-    from lightdepth.gone_settings import without_gone
-    from lightdepth.parsing import parsed
-    from lightdepth.presets import with_preset
+    from lightdepth.command_line.gone_settings import without_gone
+    from lightdepth.command_line.parsing import parsed
+    from lightdepth.command_line.presets import with_preset
 
     from .datamodule import FrameDataModule
     from .fit import check_output, fit
@@ -61,9 +61,9 @@ def training_parser() -> Parser:
     """Every option of a training run: of the model, its data, how it is watched, and Lightning's Trainer."""
     import lightning.pytorch as pl
 
+    from lightdepth.command_line.parsing import Parser, finish
+    from lightdepth.command_line.presets import preset_help
     from lightdepth.module import LightDepth
-    from lightdepth.parsing import Parser, finish
-    from lightdepth.presets import preset_help
 
     from .datamodule import FrameData
     from .fit import FitConfig

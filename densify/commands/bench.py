@@ -25,8 +25,8 @@ from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, Recipe, load_mod
 from densify.config import DensifyConfig, OfflineConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
+from lightdepth.command_line.options import Group
 from lightdepth.files.writing import write_whole
-from lightdepth.options import Group
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, git_revision, plain, recorded, run_folder, versions
 

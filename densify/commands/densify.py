@@ -11,9 +11,9 @@ from densify.inputs import check_unit, fitted_light, map_and_frames
 from densify.joining import MergeConfig
 from densify.page import densify_page, joined_section
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
-from lightdepth.options import Group
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.reconstruction import SfmConfig
 

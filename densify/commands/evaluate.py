@@ -10,7 +10,7 @@ from densify.evaluation.records import Sources
 from densify.evaluation.tables import write_evaluations
 from densify.judged import JudgingConfig, TruthSource, judge_asked, read_asked
 from lightdepth.checkpoint import load_model
-from lightdepth.options import Group
+from lightdepth.command_line.options import Group
 from lightdepth.reporting.run import recorded, run_folder
 
 

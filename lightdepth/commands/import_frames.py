@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.importing.doubts import doubts, facts
@@ -22,7 +23,6 @@ from lightdepth.importing.regions import find_regions, read_overlay_mask, tissue
 from lightdepth.importing.scan import scanned, write_measures
 from lightdepth.importing.selection import KEPT, Choice, selected
 from lightdepth.importing.source import content_hash, open_source
-from lightdepth.options import Group
 from lightdepth.reporting.run import recorded, run_folder
 
 DEFAULT_RATE = 5.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
-from lightdepth.options import Group
 from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.progress import Progress

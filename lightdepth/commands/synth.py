@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from lightdepth.calibration import read_light
+from lightdepth.command_line.options import Group
 from lightdepth.errors import InputError
-from lightdepth.options import Group
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import Lens, render_sequence

@@ -12,8 +12,8 @@ from typing import Any
 import yaml
 from jsonargparse import ArgumentParser, Namespace
 
+from lightdepth.command_line.presets import shipped
 from lightdepth.errors import InputError
-from lightdepth.presets import shipped
 from lightdepth.reporting.run import plain
 
 from ..cli import as_yaml

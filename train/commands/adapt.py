@@ -15,11 +15,11 @@ from pathlib import Path
 import lightning.pytorch as pl
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model, save_model
+from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.losses import LossConfig
 from lightdepth.models import DeclineModel, NetworkModel, working_size
-from lightdepth.options import Group
 from lightdepth.reporting.run import Run, plain, recorded, run_folder, versions
 
 from ..adapting.card import AdaptedCard, target_loss

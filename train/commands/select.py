@@ -15,11 +15,11 @@ from typing import Literal
 
 import numpy as np
 
+from lightdepth.command_line.options import Group
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.files.writing import Content, write_together
 from lightdepth.maps import read_map
-from lightdepth.options import Group
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.report import Report

@@ -14,7 +14,7 @@ from typing import NoReturn
 FOLDERS = {"train": "train", "ablate": "ablation"}
 """Folder of configs/ that holds a verb's presets; verbs that are not here have none."""
 
-_HERE = Path(__file__).resolve().parent
+_HERE = Path(__file__).resolve().parents[1]
 # Without links (some checkouts have none) the repository's own folder serves.
 _CONFIGS = next((folder for folder in (_HERE / "configs", _HERE.parent / "configs") if folder.is_dir()), _HERE)
 

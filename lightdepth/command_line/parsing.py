@@ -1,6 +1,6 @@
 """What the parser of a verb adds to jsonargparse: help on a page, mistakes in a line, one value in place of a list.
 
-A parser knows its page (lightdepth.pages): `--help` shows the everyday options and the examples, `--help-all` every
+A parser knows its page (`pages.py`): `--help` shows the everyday options and the examples, `--help-all` every
 option. Words of the command line are brought into jsonargparse's form first, because it derives options from signatures
 without these: dashes for underscores (it has aliases only for options that are declared one by one), flags without a
 value (ActionYesNo, likewise), and a single value where a list is wanted.
@@ -23,7 +23,7 @@ from typing import Any, Literal, NoReturn, Union, get_args, get_origin
 import yaml
 from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
 
-from lightdepth.pages import Page
+from lightdepth.command_line.pages import Page
 
 HELP, HELP_ALL = ("-h", "--help"), ("--help-all", "--help_all")
 _WIDTH = 100

@@ -18,7 +18,7 @@ from lightdepth.errors import InputError
 NAMES = ("train", "densify")
 
 
-def own_packages_first(home: Path = Path(__file__).resolve().parents[1]) -> None:
+def own_packages_first(home: Path = Path(__file__).resolve().parents[2]) -> None:
     """Makes NAMES mean the packages in `home`, the folder that `lightdepth` was imported from.
 
     Raises InputError when another module of such a name is loaded already: whoever loaded it may still need it.
