@@ -14,7 +14,7 @@ from lightdepth.errors import InputError
 from lightdepth.options import Group
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
-from lightdepth.sfm.reconstruction import SfmConfig
+from lightdepth.sfm.config import SfmConfig
 
 
 def live(
