@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -69,7 +68,7 @@ class Coverage:
 
         return Coverage(self.area * scale**2, self.well * scale**2, of(self.weak), of(self.holes))
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> dict[str, object]:
         """For run.json: areas, shares, and every listed region with its place and frame."""
         regions = {
             name: [{"area": r.area, "center": r.center.tolist(), "frame": r.frame} for r in found]

@@ -224,7 +224,7 @@ def map_folders(path: Path) -> list[Path]:
     return sorted(p for p in path.glob("map_*") if p.is_dir()) if path.is_dir() else []
 
 
-def run_record(path: Path) -> dict[str, Any]:
+def run_record(path: Path) -> Mapping[str, object]:
     """run.json of a run folder, or of the one that a map folder is in; empty where there is none."""
     folder = path.parent if map_folders(path) == [path] else path
     return read_json(folder / "run.json") if (folder / "run.json").is_file() else {}

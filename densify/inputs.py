@@ -18,7 +18,8 @@ from lightdepth.maps import read_map
 from lightdepth.models import DepthModel
 from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run
-from lightdepth.sfm.reconstruction import SfmConfig, sparse_map_from_frames
+from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.reconstruction import sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
 from lightdepth.sparse_map import Keyframe, SparseMap
 

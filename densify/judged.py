@@ -33,7 +33,7 @@ from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.models import DepthModel
 from lightdepth.reporting.run import Run
-from lightdepth.sfm.reconstruction import SfmConfig
+from lightdepth.sfm.config import SfmConfig
 from lightdepth.sparse_map import SparseMap
 
 

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
@@ -84,6 +83,10 @@ class Way:
     straight: float
     over_holes: float
 
+    def scaled(self, scale: float) -> Way:
+        """The same in another unit."""
+        return Way(self.points * scale, self.length * scale, self.straight * scale, self.over_holes * scale)
+
 
 @dataclass(frozen=True)
 class Area:
@@ -92,6 +95,11 @@ class Area:
     area: float
     triangles: np.ndarray
     outline: float | None = None
+
+    def scaled(self, scale: float) -> Area:
+        """The same in another unit."""
+        outline = None if self.outline is None else self.outline * scale
+        return Area(self.area * scale**2, self.triangles, outline)
 
 
 def on_wall(wall: Wall, points: np.ndarray, reach: float = 5.0) -> np.ndarray:
@@ -254,9 +262,50 @@ def places_in_frame(dense: DenseMapFiles, frame: int, pixels: np.ndarray) -> np.
     return pose[:3, 3] + distance[:, None] * (rays @ pose[:3, :3].T)
 
 
-def measured(
-    dense: DenseMapFiles, places: np.ndarray, radius: float | None = None, scale: float = 1.0
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Measured:
+    """What was measured at places of a surface: a way between two of them, or the area around or between them."""
+
+    places: np.ndarray
+    """the places (n, 3) on the surface that were meant"""
+    found: Way | Area
+    """lengths and areas, in the unit asked for"""
+    least_confidence: float | None = None
+    """least confidence of the vertices there, where the surface has it"""
+    least_views: int | None = None
+    """least number of keyframes that saw a vertex there, where the surface has it"""
+
+    def record(self) -> dict[str, object]:
+        """For a file."""
+        record: dict[str, object] = {"places": self.places.tolist()}
+        if isinstance(self.found, Way):
+            way = self.found
+            record |= {"length": way.length, "straight": way.straight, "over_holes": way.over_holes}
+        else:
+            record |= {"area": self.found.area, "outline": self.found.outline}
+        if self.least_views is not None:
+            record |= {"least_confidence": self.least_confidence, "least_views": self.least_views}
+        return record
+
+    def summary(self, unit: str) -> str:
+        """What was measured, for people."""
+        if isinstance(self.found, Way):
+            way = self.found
+            text = f"along the surface {number(way.length)} {unit}, straight {number(way.straight)} {unit}"
+            if way.over_holes > 0:
+                text += f"; {number(way.over_holes)} {unit} of it over holes"
+        else:
+            text = f"area {number(self.found.area)} {unit}²"
+            if self.found.outline is not None:
+                text += f", outline {number(self.found.outline)} {unit}"
+        if self.least_views is not None:
+            text += f"; seen by {self.least_views} keyframes or more, confidence {self.least_confidence:.2f} or more"
+        if unit != "mm":
+            text += ". A map has no size of its own: --mm-per-unit gives it one"
+        return text
+
+
+def measured(dense: DenseMapFiles, places: np.ndarray, radius: float | None = None, scale: float = 1.0) -> Measured:
     """What one place and a radius (an area), two places (a length), or an outline of more (both) measure.
 
     `scale` multiplies lengths at the end; radius is in the scaled unit. Raises InputError for anything else.
@@ -272,39 +321,15 @@ def measured(
         raise InputError(f"--radius {radius}; expected a positive length")
     wall = Wall(dense.vertices, dense.triangles)
     places = on_wall(wall, places)
-    result: dict[str, Any] = {"places": (places * scale).tolist()}
+    found: Way | Area
     if len(places) == 2:
-        way = path(wall, *places)
-        triangles = wall.surface.closest(way.points)[1]
-        result |= {"length": way.length * scale, "straight": way.straight * scale, "over_holes": way.over_holes * scale}
+        found = path(wall, *places)
+        triangles = wall.surface.closest(found.points)[1]
     else:
         found = disc(wall, places[0], radius / scale) if radius is not None else patch(wall, places)
         triangles = found.triangles
-        result["area"] = found.area * scale**2
-        result["outline"] = None if found.outline is None else found.outline * scale
+    confidence, views = None, None
     if dense.confidence is not None and dense.views is not None and len(triangles):
         seen = dense.triangles[triangles]
-        result["least_confidence"], result["least_views"] = (
-            float(dense.confidence[seen].min()),
-            int(dense.views[seen].min()),
-        )
-    return result
-
-
-def summary(found: dict[str, Any], unit: str) -> str:
-    """What was measured, for people."""
-    if "length" in found:
-        text = f"along the surface {number(found['length'])} {unit}, straight {number(found['straight'])} {unit}"
-        if found["over_holes"] > 0:
-            text += f"; {number(found['over_holes'])} {unit} of it over holes"
-    else:
-        text = f"area {number(found['area'])} {unit}²"
-        if found["outline"] is not None:
-            text += f", outline {number(found['outline'])} {unit}"
-    if "least_views" in found:
-        text += (
-            f"; seen by {found['least_views']} keyframes or more, confidence {found['least_confidence']:.2f} or more"
-        )
-    if unit != "mm":
-        text += ". A map has no size of its own: --mm-per-unit gives it one"
-    return text
+        confidence, views = float(dense.confidence[seen].min()), int(dense.views[seen].min())
+    return Measured(places * scale, found.scaled(scale), confidence, views)

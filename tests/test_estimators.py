@@ -10,6 +10,7 @@ import pytest
 
 from densify.bench.estimators import (
     ESTIMATORS,
+    EstimatorFigures,
     EstimatorsConfig,
     compared_estimators,
     consensus_scale,
@@ -25,7 +26,7 @@ from lightdepth.errors import InputError
 def error() -> dict[tuple[str, float, str], float]:
     """Median error by kind, share and estimator, 100 points."""
     config = EstimatorsConfig(shares=(0.0, 0.3, 0.55), points=(100,), draws=25, seed=1)
-    return {(r["kind"], r["wrong_share"], r["estimator"]): r["median_error"] for r in compared_estimators(config)}
+    return {(r.kind, r.wrong_share, r.estimator): r.median_error for r in compared_estimators(config)}
 
 
 def test_without_wrong_points_lmeds_loses_to_the_median_and_refinement_makes_good(error):
@@ -74,7 +75,7 @@ def test_questions_have_the_share_of_wrong_points_that_they_say(kind):
 def test_the_same_seed_gives_the_same_records_and_every_estimator_the_same_questions():
     config = EstimatorsConfig(shares=(0.2,), kinds=("depth",), points=(20,), draws=3)
     first, second = compared_estimators(config), compared_estimators(config)
-    assert first == second and [r["estimator"] for r in first] == list(ESTIMATORS)
+    assert first == second and [r.estimator for r in first] == list(ESTIMATORS)
     assert compared_estimators(EstimatorsConfig((0.2,), ("depth",), (20,), 3, seed=1)) != first
 
 
@@ -100,15 +101,12 @@ def test_the_verb_writes_table_figure_and_sentences_on_where_lmeds_loses(tmp_pat
 
 def test_losses_are_found_where_the_records_have_them():
     rows = [("median ratio", 0.01), ("least squares", 0.05), ("LMedS", 0.03)]
-    records = [
-        {"kind": "uniform", "points": 20, "wrong_share": 0.0, "estimator": n, "median_error": e, "p90_error": e}
-        for n, e in rows
-    ]
+    records = [EstimatorFigures("uniform", 20, 0.0, n, e, e, 0.25, e) for n, e in rows]
     assert losses(records) == [
         "Wrong points uniform: LMedS loses to the median ratio or least squares at 0% of 20 (3.0 % against 1.0 % by "
         "median ratio)."
     ]
-    table = estimators_tables([{**r, "refused_share": 0.25} for r in records])[0]
+    table = estimators_tables(records)[0]
     assert table.rows[2] == ["LMedS", "3.0 / 3.0 (25% refused)"]
 
 

@@ -64,7 +64,7 @@ def test_a_frame_that_is_lost_or_broken_is_said_and_the_others_go_on():
         "000004.png": "no frame number 4 in the folder",
     }
     assert len(surfaces[0].aligned) == 3 and len(surfaces[0].triangles)
-    assert time_spent(played, 1e9)["read"] == 3
+    assert time_spent(played, 1e9).read == 3
 
 
 def test_at_a_rate_no_keyframe_is_there_before_its_time_and_a_late_one_says_so():
@@ -80,13 +80,14 @@ def test_the_share_in_the_budget_counts_all_steps_and_waiting_only_where_it_is_a
     steps = {"read": 5.0, "predict": 100.0, "align": 5.0, "integrate": 30.0, "extract": 40.0}
     slow = {**steps, "extract": 100.0}
     played = [one(steps), one(steps, done=0.1), one(slow, done=0.1), one({"read": 1.0}, unread=True, reason="lost")]
-    figures = time_spent(played, 0.2)
-    assert (figures["keyframes"], figures["read"]) == (4, 3)
-    assert figures["share_in_budget"] == pytest.approx(2 / 3) and figures["share_in_time"] == pytest.approx(2 / 3)
-    assert figures["without_network"]["median_ms"] == pytest.approx(80)
-    assert figures["total"]["cpu_ms"] == pytest.approx(360)
-    assert figures["steps"]["extract"]["median_ms"] == pytest.approx(40)
-    assert time_spent(played[3:], 0.2) == {"keyframes": 1, "read": 0}
+    found = time_spent(played, 0.2)
+    assert (found.keyframes, found.read) == (4, 3) and found.timings is not None
+    figures = found.timings
+    assert figures.share_in_budget == pytest.approx(2 / 3) and figures.share_in_time == pytest.approx(2 / 3)
+    assert figures.without_network.median_ms == pytest.approx(80)
+    assert figures.total.cpu_ms == pytest.approx(360)
+    assert figures.steps["extract"].median_ms == pytest.approx(40)
+    assert time_spent(played[3:], 0.2).record() == {"keyframes": 1, "read": 0}
 
 
 def test_timings_are_written_a_row_a_keyframe_and_drawn(tmp_path):

@@ -12,7 +12,9 @@ from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
-from lightdepth.sfm.reconstruction import SfmConfig, evened, fisheye_fit, sparse_map_from_frames, usable_pixels
+from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.features import evened, usable_pixels
+from lightdepth.sfm.reconstruction import fisheye_fit, sparse_map_from_frames
 
 HALF = np.array([22.0, 18.0, 45.0])  # the box reaches from -HALF to HALF, in mm
 PINHOLE = Pinhole(240, 200, 150.0, 150.0, 119.0, 101.0)

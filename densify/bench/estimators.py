@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -165,7 +165,29 @@ ESTIMATORS: dict[str, Callable[[Question], tuple[float, bool]]] = {
 """A scale, and whether the estimator would use it: those that are trusted only after a test may refuse."""
 
 
-def compared_estimators(config: EstimatorsConfig, on_case: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class EstimatorFigures:
+    """Errors of one estimator over the keyframes of one combination, as estimators.json has them. Shares of 1."""
+
+    kind: Kind
+    """kind of the wrong points"""
+    points: int
+    """number of points of a keyframe"""
+    wrong_share: float
+    """share of the points that are wrong"""
+    estimator: str
+    """name of the estimator"""
+    median_error: float
+    """median over all keyframes"""
+    p90_error: float
+    """90th percentile over all keyframes"""
+    refused_share: float
+    """share of the keyframes whose scale the estimator would not use"""
+    p90_error_used: float | None
+    """90th percentile over the keyframes whose scale it would use; None where there are none"""
+
+
+def compared_estimators(config: EstimatorsConfig, on_case: Callable[[], None] = lambda: None) -> list[EstimatorFigures]:
     """One record for each kind, share, number of points and estimator."""
     records = []
     for kind in config.kinds:
@@ -179,49 +201,51 @@ def compared_estimators(config: EstimatorsConfig, on_case: Callable[[], None] = 
                     error = np.array([abs(s / right - 1) for right, s, _ in found])
                     used = np.array([ok for *_, ok in found])
                     records.append(
-                        {
-                            "kind": kind,
-                            "points": points,
-                            "wrong_share": share,
-                            "estimator": name,
-                            "median_error": float(np.median(error)),
-                            "p90_error": float(np.quantile(error, 0.9)),
-                            "refused_share": float(1 - used.mean()),
-                            "p90_error_used": float(np.quantile(error[used], 0.9)) if used.any() else None,
-                        }
+                        EstimatorFigures(
+                            kind=kind,
+                            points=points,
+                            wrong_share=share,
+                            estimator=name,
+                            median_error=float(np.median(error)),
+                            p90_error=float(np.quantile(error, 0.9)),
+                            refused_share=float(1 - used.mean()),
+                            p90_error_used=float(np.quantile(error[used], 0.9)) if used.any() else None,
+                        )
                     )
                 on_case()
     return records
 
 
-def estimators_tables(records: Sequence[dict[str, Any]]) -> list[Table]:
+def estimators_tables(records: Sequence[EstimatorFigures]) -> list[Table]:
     """For each kind and number of points: median / 90th percentile of the error in %, and what was refused."""
     tables = []
-    for kind in dict.fromkeys(r["kind"] for r in records):
-        for points in dict.fromkeys(r["points"] for r in records):
-            of = [r for r in records if r["kind"] == kind and r["points"] == points]
-            shares = list(dict.fromkeys(r["wrong_share"] for r in of))
+    for kind in dict.fromkeys(r.kind for r in records):
+        for points in dict.fromkeys(r.points for r in records):
+            of = [r for r in records if r.kind == kind and r.points == points]
+            shares = list(dict.fromkeys(r.wrong_share for r in of))
             rows = []
-            for name in dict.fromkeys(r["estimator"] for r in of):
-                own = {r["wrong_share"]: r for r in of if r["estimator"] == name}
+            for name in dict.fromkeys(r.estimator for r in of):
+                own = {r.wrong_share: r for r in of if r.estimator == name}
                 rows.append([name, *(_cell(own[share]) for share in shares)])
             title = f"Wrong points: {kind}; {points} points. Error of the scale in %: median / 90th percentile."
             tables.append(Table(title, ["Estimator", *(f"{share:.0%} wrong" for share in shares)], rows))
     return tables
 
 
-def _cell(record: dict[str, Any]) -> str:
-    text = f"{100 * record['median_error']:.1f} / {100 * record['p90_error']:.1f}"
-    return text + (f" ({record['refused_share']:.0%} refused)" if record["refused_share"] else "")
+def _cell(record: EstimatorFigures) -> str:
+    text = f"{100 * record.median_error:.1f} / {100 * record.p90_error:.1f}"
+    return text + (f" ({record.refused_share:.0%} refused)" if record.refused_share else "")
 
 
-def losses(records: Sequence[dict[str, Any]], against: Sequence[str] = ("median ratio", "least squares")) -> list[str]:
+def losses(
+    records: Sequence[EstimatorFigures], against: Sequence[str] = ("median ratio", "least squares")
+) -> list[str]:
     """Where LMedS is worse than a simpler estimator, in sentences: the table says it, but among many numbers."""
-    found = {(r["kind"], r["points"], r["wrong_share"], r["estimator"]): r["median_error"] for r in records}
+    found = {(r.kind, r.points, r.wrong_share, r.estimator): r.median_error for r in records}
     sentences = []
-    for kind in dict.fromkeys(r["kind"] for r in records):
+    for kind in dict.fromkeys(r.kind for r in records):
         lost = []
-        for points, share in dict.fromkeys((r["points"], r["wrong_share"]) for r in records if r["kind"] == kind):
+        for points, share in dict.fromkeys((r.points, r.wrong_share) for r in records if r.kind == kind):
             best = min(against, key=lambda name: found[kind, points, share, name])
             mine, other = found[kind, points, share, "LMedS"], found[kind, points, share, best]
             if mine > other:
@@ -231,23 +255,23 @@ def losses(records: Sequence[dict[str, Any]], against: Sequence[str] = ("median 
     return sentences
 
 
-def estimators_picture(records: Sequence[dict[str, Any]]) -> bytes:
+def estimators_picture(records: Sequence[EstimatorFigures]) -> bytes:
     """90th percentile of the error over the share of wrong points: kinds across, numbers of points down."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    kinds = list(dict.fromkeys(r["kind"] for r in records))
-    counts = list(dict.fromkeys(r["points"] for r in records))
-    names = list(dict.fromkeys(r["estimator"] for r in records))
+    kinds = list(dict.fromkeys(r.kind for r in records))
+    counts = list(dict.fromkeys(r.points for r in records))
+    names = list(dict.fromkeys(r.estimator for r in records))
     figure = Figure(figsize=(3.6 * len(kinds) + 0.6, 2.6 * len(counts) + 1.0), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(counts), len(kinds), sharex=True, sharey=True, squeeze=False)
     for row, points in zip(grid, counts, strict=True):
         for axes, kind in zip(row, kinds, strict=True):
             for i, name in enumerate(names):
-                of = [r for r in records if (r["kind"], r["points"], r["estimator"]) == (kind, points, name)]
+                of = [r for r in records if (r.kind, r.points, r.estimator) == (kind, points, name)]
                 line = "-" if i >= len(names) - 3 else "--"
-                x, y = [100 * r["wrong_share"] for r in of], [100 * r["p90_error"] for r in of]
+                x, y = [100 * r.wrong_share for r in of], [100 * r.p90_error for r in of]
                 axes.plot(x, y, line, label=name, linewidth=1.8 if line == "-" else 1.2, color=f"C{i}")
             axes.set_yscale("log")
             axes.spines[["top", "right"]].set_visible(False)

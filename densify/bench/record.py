@@ -72,7 +72,7 @@ class BenchFile(BaseModel):
         return {cell.scene: cell.seed for cell in self.cells}
 
 
-def record(config: BenchConfig, cells: Sequence[Mapping[str, Any]], seconds: Mapping[str, float]) -> dict[str, Any]:
+def record(config: BenchConfig, cells: Sequence[Mapping[str, object]], seconds: Mapping[str, float]) -> dict[str, Any]:
     """What bench.json says. All but `seconds` is the same when made twice."""
     return plain(
         {

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from densify.dense_map import DenseMap
 from densify.evaluation.errors import compare_depth, rms
 from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import JudgedMap
+from densify.evaluation.records import SurfaceFigures
 from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
 from densify.pipeline import densify
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -95,16 +95,104 @@ def load_models(checkpoints: Sequence[str]) -> list[DepthModel]:
     return models
 
 
-def run_scene(scene: Predicted, config: BenchConfig, on_row: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class SlamFigures:
+    """What the simulated SLAM made of a scene."""
+
+    keyframes: int
+    """number of keyframes in its submaps"""
+    submaps: int
+    """number of its submaps"""
+    submaps_aligned: int
+    """number of submaps whose trajectory could be aligned to the true one"""
+    rms_ate_mm: float | None
+    """error of the aligned keyframes' centres; None where no submap could be aligned"""
+
+
+@dataclass(frozen=True)
+class KeyframeFigures:
+    """Errors of the depth of aligned keyframes, in the scale of the map: of one keyframe, or their mean."""
+
+    depth_abs_rel: float
+    """mean of |p - q| / q, p predicted and q true depth"""
+    depth_rmse_mm: float
+    """root of the mean of (p - q)²"""
+    scale_error: float
+    """|median p / q - 1|"""
+
+    @classmethod
+    def mean(cls, found: Sequence[KeyframeFigures]) -> KeyframeFigures:
+        return cls(*(float(np.mean([getattr(f, field.name) for f in found])) for field in fields(cls)))
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Keyframes of a dense map."""
+
+    keyframes: int
+    """number of keyframes"""
+    keyframes_aligned: int
+    """number of those whose alignment is trusted"""
+
+
+@dataclass(frozen=True)
+class RowFigures:
+    """What one way to make a surface came to: figures, or why there are none. Flat in the file."""
+
+    error: str = ""
+    """why there are no figures; empty where there are"""
+    surface: SurfaceFigures | None = None
+    """errors of the surface's points"""
+    submaps_judged: int = 0
+    """number of submaps that have a surface to compare"""
+    depth: KeyframeFigures | None = None
+    """errors of the keyframes' depth, for dense maps"""
+    counts: Counts | None = None
+    """how many keyframes took part, for dense maps"""
+
+    def record(self) -> dict[str, object]:
+        """As bench.json has it."""
+        parts = (self.depth, self.counts)
+        flat = {key: value for part in parts if part is not None for key, value in asdict(part).items()}
+        if self.surface is None:
+            return {"error": self.error, **flat}
+        return {**asdict(self.surface), "submaps_judged": self.submaps_judged, **flat}
+
+
+@dataclass(frozen=True)
+class CellFigures:
+    """One scene at one share of wrong points."""
+
+    scene: str
+    """name of the scene"""
+    seed: int
+    """seed that its colon is made from"""
+    wrong_share: float
+    """share of the map's points that are wrong"""
+    frames: int
+    """number of frames of the scene"""
+    trajectory: SlamFigures
+    """what the SLAM made of it"""
+    rows: Mapping[str, RowFigures]
+    """the surfaces, by the name of the row"""
+
+    def record(self) -> dict[str, object]:
+        """As bench.json has it."""
+        shared = {"scene": self.scene, "seed": self.seed, "wrong_share": self.wrong_share, "frames": self.frames}
+        rows = {name: row.record() for name, row in self.rows.items()}
+        return {**shared, "trajectory": asdict(self.trajectory), "rows": rows}
+
+
+def run_scene(scene: Predicted, config: BenchConfig, on_row: Callable[[], None] = lambda: None) -> list[CellFigures]:
     """The cells of a scene, one for each share of wrong points. A row that cannot be judged says why."""
     return [_cell(scene, share, config, on_row) for share in config.shares(scene.rendered.scene)]
 
 
-def _cell(scene: Predicted, share: float, config: BenchConfig, on_row: Callable[[], None]) -> dict[str, Any]:
+def _cell(scene: Predicted, share: float, config: BenchConfig, on_row: Callable[[], None]) -> CellFigures:
     rendered = scene.rendered
     sparse_map = rendered.slam(share).map
     sparse = [_model(s, sparse=s.points) for s in sparse_map.submaps]
-    rows: dict[str, Any] = {}
+    rows: dict[str, RowFigures] = {}
     inliers: list[JudgedMap] = []
     for model, known in scene.predictions.items():
         for recipe in config.recipes:
@@ -114,14 +202,8 @@ def _cell(scene: Predicted, share: float, config: BenchConfig, on_row: Callable[
             inliers = [_model(m.submap, sparse_inliers=m.submap.points[m.judged_points()[1]]) for m in made]
             on_row()
     around = {SPARSE: _judged(sparse, rendered, "sparse"), INLIERS: _judged(inliers, rendered, "sparse_inliers")}
-    return {
-        "scene": rendered.scene.name,
-        "seed": rendered.scene.seed,
-        "wrong_share": share,
-        "frames": rendered.scene.frames,
-        "trajectory": _trajectory(sparse, rendered),
-        "rows": {**around, **rows},
-    }
+    seen, slam = rendered.scene, _trajectory(sparse, rendered)
+    return CellFigures(seen.name, seen.seed, share, seen.frames, slam, {**around, **rows})
 
 
 def _known(predictions: Mapping[str, DepthPrediction], frame: Frame) -> DepthPrediction:
@@ -132,40 +214,40 @@ def _model(submap: Submap, **clouds: np.ndarray) -> JudgedMap:
     return JudgedMap(keyframe_trajectory(submap), clouds)
 
 
-def _trajectory(models: Sequence[JudgedMap], rendered: Rendered) -> dict[str, Any]:
+def _trajectory(models: Sequence[JudgedMap], rendered: Rendered) -> SlamFigures:
     aligned = []
     for model in models:
         with suppress(InputError):
             aligned.append(align_trajectory(model.trajectory, rendered.truth.poses))
     keyframes = {n for m in models for n in m.trajectory.numbers.tolist()}
     error = rms(np.concatenate([a.ate_sim3 for a in aligned])) if aligned else None
-    return {"keyframes": len(keyframes), "submaps": len(models), "submaps_aligned": len(aligned), "rms_ate_mm": error}
+    return SlamFigures(len(keyframes), len(models), len(aligned), error)
 
 
-def _judged(models: Sequence[JudgedMap], rendered: Rendered, cloud: str) -> dict[str, Any]:
+def _judged(models: Sequence[JudgedMap], rendered: Rendered, cloud: str) -> RowFigures:
     try:
-        result = judge_maps(models, rendered.truth).as_dict()
+        found = judge_maps(models, rendered.truth).judged
     except InputError as error:
-        return {"error": str(error)}
-    if cloud not in result["all"]:
-        return {"error": "no map has a surface that can be compared"}
-    return {**result["all"][cloud], "submaps_judged": sum(bool(m.get(cloud)) for m in result["maps"])}
+        return RowFigures(str(error))
+    if cloud not in found.pooled:
+        return RowFigures("no map has a surface that can be compared")
+    submaps = sum(m.clouds.get(cloud) is not None for m in found.maps)
+    return RowFigures(surface=found.pooled[cloud], submaps_judged=submaps)
 
 
-def _dense_row(made: Sequence[DenseMap], rendered: Rendered, known: Mapping[str, DepthPrediction]) -> dict[str, Any]:
+def _dense_row(made: Sequence[DenseMap], rendered: Rendered, known: Mapping[str, DepthPrediction]) -> RowFigures:
     """The surface's figures, and the mean over the aligned keyframes of their depth's, in the scale of the map."""
     depths = [d for m in made for d in _depths(m, rendered, known)]
     found = _judged([_model(m.submap, dense=m.vertices) for m in made], rendered, "dense")
-    keyframes = sum(len(m.alignments) for m in made)
-    counts = {"keyframes": keyframes, "keyframes_aligned": sum(len(m.aligned) for m in made)}
-    if "error" in found or not depths:
+    counts = Counts(sum(len(m.alignments) for m in made), sum(len(m.aligned) for m in made))
+    if found.error or not depths:
         reasons = [a.reason for m in made for a in m.alignments if not a.ok]
-        why = f"no keyframe was aligned; the first: {reasons[0]}" if not counts["keyframes_aligned"] else found["error"]
-        return {"error": why, **counts}
-    return {**found, **{name: float(np.mean([d[name] for d in depths])) for name in depths[0]}, **counts}
+        why = f"no keyframe was aligned; the first: {reasons[0]}" if not counts.keyframes_aligned else found.error
+        return RowFigures(why, counts=counts)
+    return replace(found, depth=KeyframeFigures.mean(depths), counts=counts)
 
 
-def _depths(made: DenseMap, rendered: Rendered, known: Mapping[str, DepthPrediction]) -> list[dict[str, float]]:
+def _depths(made: DenseMap, rendered: Rendered, known: Mapping[str, DepthPrediction]) -> list[KeyframeFigures]:
     """Of each aligned keyframe of a submap, its depth brought to mm by the submap's Sim(3) alone: AbsRel, RMSE, and
     the error of its scale, |median p / q - 1|."""
     try:
@@ -180,6 +262,5 @@ def _depths(made: DenseMap, rendered: Rendered, known: Mapping[str, DepthPredict
             depth = compare_depth(alignment.applied(known[frame.name]).scaled(mm), frame)
             errors = depth.errors(["none"])
             ratio = np.median(depth.predicted[depth.valid] / depth.truth[depth.valid])
-            row = {"depth_abs_rel": errors["abs_rel_none"], "depth_rmse_mm": errors["rmse_mm_none"]}
-            found.append({**row, "scale_error": abs(float(ratio) - 1)})
+            found.append(KeyframeFigures(errors["abs_rel_none"], errors["rmse_mm_none"], abs(float(ratio) - 1)))
     return found

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from densify.bench.estimators import (
     NO_LIBRARY,
@@ -21,12 +20,13 @@ from densify.bench.estimators import (
 from densify.bench.record import notes, read_bench, record, tables
 from densify.bench.scenes import Size, scenes
 from densify.bench.verdict import compare
-from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, Recipe, load_models, predicted, run_scene
+from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, CellFigures, Recipe, load_models, predicted, run_scene
 from densify.config import DensifyConfig, OfflineConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
 from lightdepth.files.writing import write_whole
+from lightdepth.models import DepthModel
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, git_revision, plain, recorded, run_folder, versions
 
@@ -87,21 +87,27 @@ def run(
     )
     models = load_models(checkpoints)
     with run_folder(output, "bench", arguments, overwrite) as folder:
-        chosen = scenes(config.size, config.first_seed)
-        rows = len(models) * len(recipes)
-        cells: list[dict[str, Any]] = []
-        seconds: dict[str, float] = {}
-        with Progress("Benchmark", sum(rows * len(config.shares(s)) * s.keyframes for s in chosen)) as bar:
-            for scene in chosen:
-                start = time.perf_counter()
-                seen = predicted(scene, config.image_size, models)
-                cells += run_scene(seen, config, partial(bar.advance, scene.keyframes))
-                seconds[scene.name] = round(time.perf_counter() - start, 3)
-        found = record(config, cells, seconds)
+        cells, seconds = _cells(config, models)
+        found = record(config, [cell.record() for cell in cells], seconds)
         _write_json(folder, "bench.json", found)
         text = "\n".join([*(t.markdown() for t in tables(found)), *(f"{note}\n" for note in notes(found))])
         (folder.folder / "bench.md").write_text(text)
         folder.log(text)
+
+
+def _cells(config: BenchConfig, models: Sequence[DepthModel]) -> tuple[list[CellFigures], dict[str, float]]:
+    """The cells of all scenes, and the seconds that each scene took."""
+    chosen = scenes(config.size, config.first_seed)
+    rows = len(models) * len(config.recipes)
+    cells: list[CellFigures] = []
+    seconds: dict[str, float] = {}
+    with Progress("Benchmark", sum(rows * len(config.shares(s)) * s.keyframes for s in chosen)) as bar:
+        for scene in chosen:
+            start = time.perf_counter()
+            seen = predicted(scene, config.image_size, models)
+            cells += run_scene(seen, config, partial(bar.advance, scene.keyframes))
+            seconds[scene.name] = round(time.perf_counter() - start, 3)
+    return cells, seconds
 
 
 def compare_runs(a: Path, b: Path, output: Path | None = None, seed: int = 0) -> None:
@@ -144,18 +150,14 @@ def compare_estimators(
         with Progress("Estimators", len(config.kinds) * len(points) * len(shares)) as bar:
             records = compared_estimators(config, bar.advance)
         said = [*losses(records), NO_LIBRARY]
-        data: dict[str, Any] = {
-            "kind": "estimators",
-            "unit": "shares of 1: |found scale / true scale - 1|",
-            "config": asdict(config),
-        }
-        data |= {"records": records, "notes": said, "versions": versions(), "revision": git_revision()}
-        _write_json(folder, "estimators.json", data)
+        unit = "shares of 1: |found scale / true scale - 1|"
+        data = {"kind": "estimators", "unit": unit, "config": asdict(config), "records": records, "notes": said}
+        _write_json(folder, "estimators.json", data | {"versions": versions(), "revision": git_revision()})
         text = "\n".join([*(t.markdown() for t in estimators_tables(records)), *(f"{line}\n" for line in said)])
         (folder.folder / "estimators.md").write_text(text)
         (folder.folder / "estimators.png").write_bytes(estimators_picture(records))
         folder.log(text)
 
 
-def _write_json(run: Run, name: str, data: Mapping[str, Any]) -> None:
+def _write_json(run: Run, name: str, data: Mapping[str, object]) -> None:
     (run.folder / name).write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n")

@@ -15,7 +15,7 @@ from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.reporting.run import recorded, run_folder
-from lightdepth.sfm.reconstruction import SfmConfig
+from lightdepth.sfm.config import SfmConfig
 
 
 def densify(

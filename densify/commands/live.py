@@ -14,7 +14,7 @@ from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
-from lightdepth.sfm.reconstruction import SfmConfig
+from lightdepth.sfm.config import SfmConfig
 
 
 def live(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.evaluation.judged_map import read_run
-from densify.measure import chosen_map, measured, places_in_frame, run_unit, summary
+from densify.measure import chosen_map, measured, places_in_frame, run_unit
 from lightdepth.errors import InputError
 from lightdepth.files.writing import write_whole
 from lightdepth.reporting.run import plain
@@ -49,7 +49,7 @@ def measure(
         assert frame is not None and pixels is not None
         places = places_in_frame(dense, frame, np.asarray(pixels, float).reshape(-1, 2))
     found = measured(dense, places, radius, mm_per_unit or 1.0)
-    result = {"run": str(run), "map": dense.id, "unit": unit, **found}
-    print(summary(found, unit))
+    result = {"run": str(run), "map": dense.id, "unit": unit, **found.record()}
+    print(found.summary(unit))
     if output is not None:
         write_whole(output, json.dumps(plain(result), indent=1) + "\n")

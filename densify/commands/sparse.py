@@ -11,7 +11,7 @@ from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
 from lightdepth.reporting.run import recorded, run_folder
-from lightdepth.sfm.reconstruction import SfmConfig
+from lightdepth.sfm.config import SfmConfig
 
 
 def sparse(

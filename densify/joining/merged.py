@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -30,15 +29,10 @@ class Merged:
     def groups(self) -> list[dict[int, Similarity]]:
         return [g for g in self.meeting.groups if len(g) > 1]
 
-    def record(self, unit: float = 1.0) -> dict[str, Any]:
+    def record(self, unit: float = 1.0) -> dict[str, object]:
         """For run.json. A transform is as `evaluate --join` reads it: X_second = scale · rotation X_first +
         translation, where a map's unit is written as `unit`."""
-        joined = []
-        for result, group in zip(self.results, self.groups, strict=True):
-            first = next(iter(group))
-            transforms = [{"first": i, "second": first, **_numbers(s, unit)} for i, s in group.items() if i != first]
-            joined.append({"folder": joined_name(result), "maps": list(group), "unit_of": first})
-            joined[-1]["transforms"] = transforms
+        joined = [_joined(result, g, unit) for result, g in zip(self.results, self.groups, strict=True)]
         joins = [{**asdict(replace(j, target_from_source=None)), "ok": j.ok} for j in self.tried]
         return {"joined": joined, "joins": joins, "alone": self.meeting.alone()}
 
@@ -51,7 +45,13 @@ def joined_name(result: SubmapResult) -> str:
     return f"joined_{result.dense.submap.id:03d}"
 
 
-def _numbers(s: Similarity, unit: float) -> dict[str, Any]:
+def _joined(result: SubmapResult, group: Mapping[int, Similarity], unit: float) -> dict[str, object]:
+    first = next(iter(group))
+    transforms = [{"first": i, "second": first, **_numbers(s, unit)} for i, s in group.items() if i != first]
+    return {"folder": joined_name(result), "maps": list(group), "unit_of": first, "transforms": transforms}
+
+
+def _numbers(s: Similarity, unit: float) -> dict[str, object]:
     return {"scale": s.scale, "rotation": s.rotation.tolist(), "translation": (unit * s.translation).tolist()}
 
 

@@ -9,9 +9,8 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -116,31 +115,76 @@ def _play_one(
     )
 
 
-def time_spent(played: Sequence[Played], budget: float) -> dict[str, Any]:
-    """Figures of a run, in milliseconds: per step the median and the 95th percentile on the clock, and the median of
-    processor time; the share of keyframes whose time is at most `budget` [s], and whose surface was there that long
-    after their arrival."""
+@dataclass(frozen=True)
+class StepFigures:
+    """What a step took over the keyframes of a run, in milliseconds."""
+
+    median_ms: float
+    """median on the clock"""
+    p95_ms: float
+    """95th percentile on the clock"""
+    cpu_ms: float
+    """median of processor time, of all threads together"""
+
+    @classmethod
+    def of(cls, times: Iterable[StepTime]) -> StepFigures:
+        wall, cpu = (1000 * np.array(a) for a in zip(*((t.wall, t.cpu) for t in times), strict=True))
+        return cls(float(np.median(wall)), float(np.quantile(wall, 0.95)), float(np.median(cpu)))
+
+
+@dataclass(frozen=True)
+class Timings:
+    """What the keyframes of a run took."""
+
+    budget_ms: float
+    """time that a keyframe may take, milliseconds"""
+    share_in_budget: float
+    """share of keyframes whose time is at most the budget"""
+    share_in_time: float
+    """share of keyframes whose surface was there that long after their arrival"""
+    steps: Mapping[str, StepFigures]
+    """by step"""
+    without_network: StepFigures
+    """all steps but inference"""
+    total: StepFigures
+    """all steps"""
+    kept_bytes: int
+    """memory that the surfaces hold"""
+
+
+@dataclass(frozen=True)
+class TimeSpent:
+    """How many keyframes a run had, and what those took that could be read."""
+
+    keyframes: int
+    """number of keyframes"""
+    read: int
+    """number of keyframes whose image was there"""
+    timings: Timings | None
+    """what these took; None where there are none"""
+
+    def record(self) -> dict[str, object]:
+        """For run.json, flat."""
+        timings = {} if self.timings is None else asdict(self.timings)
+        return {"keyframes": self.keyframes, "read": self.read, **timings}
+
+
+def time_spent(played: Sequence[Played], budget: float) -> TimeSpent:
+    """Figures of a run whose keyframes may take `budget` seconds each."""
     shown = [p for p in played if not p.unread]
     if not shown:
-        return {"keyframes": len(played), "read": 0}
-
-    def figures(times: Iterable[StepTime]) -> dict[str, float]:
-        wall, cpu = (1000 * np.array(a) for a in zip(*((t.wall, t.cpu) for t in times), strict=True))
-        named = {"median_ms": np.median(wall), "p95_ms": np.quantile(wall, 0.95), "cpu_ms": np.median(cpu)}
-        return {name: float(value) for name, value in named.items()}
-
+        return TimeSpent(len(played), 0, None)
     without = [sum((t for step, t in p.times.items() if step != "predict"), StepTime()) for p in shown]
-    return {
-        "keyframes": len(played),
-        "read": len(shown),
-        "budget_ms": 1000 * budget,
-        "share_in_budget": float(np.mean([p.total.wall <= budget for p in shown])),
-        "share_in_time": float(np.mean([p.done - p.arrival <= budget for p in shown])),
-        "steps": {step: figures([p.times.get(step, StepTime()) for p in shown]) for step in ALL_STEPS},
-        "without_network": figures(without),
-        "total": figures([p.total for p in shown]),
-        "kept_bytes": sum({p.map: p.kept_bytes for p in shown}.values()),
-    }
+    timings = Timings(
+        budget_ms=1000 * budget,
+        share_in_budget=float(np.mean([p.total.wall <= budget for p in shown])),
+        share_in_time=float(np.mean([p.done - p.arrival <= budget for p in shown])),
+        steps={step: StepFigures.of([p.times.get(step, StepTime()) for p in shown]) for step in ALL_STEPS},
+        without_network=StepFigures.of(without),
+        total=StepFigures.of([p.total for p in shown]),
+        kept_bytes=sum({p.map: p.kept_bytes for p in shown}.values()),
+    )
+    return TimeSpent(len(played), len(shown), timings)
 
 
 def write_timings(played: Sequence[Played], path: Path) -> None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
-from densify.coverage import CoverageConfig
+from densify.coverage import Coverage, CoverageConfig
 from densify.coverage import coverage as coverage_of
 from densify.dense_map import DenseMap
 from densify.live.play import Played, time_spent, timings_picture, write_timings
@@ -14,23 +13,46 @@ from lightdepth.errors import InputError
 from lightdepth.reporting.run import Run, plain
 
 
+@dataclass(frozen=True)
+class _MapRecord:
+    """One submap's surface."""
+
+    map: int
+    """number of the submap"""
+    keyframes: int
+    """number of its keyframes that were looked at"""
+    aligned: int
+    """number of those that the surface is made of"""
+    vertices: int
+    """number of its vertices"""
+    voxel: float
+    """edge of a voxel, map units"""
+    coverage: Coverage | None
+    """how well it was seen; None for an empty one"""
+
+    def record(self) -> dict[str, object]:
+        """For run.json."""
+        counts = {"map": self.map, "keyframes": self.keyframes, "aligned": self.aligned, "vertices": self.vertices}
+        seen = {} if self.coverage is None else {"coverage": self.coverage.record()}
+        return {**counts, "voxel": self.voxel, **seen}
+
+
 class PlayedRun:
     """The run folder of a played sequence; `mm_per_unit` where lengths are to be written in mm."""
 
     def __init__(self, run: Run, coverage: CoverageConfig, mm_per_unit: float | None) -> None:
         self._run, self._coverage, self._mm_per_unit = run, coverage, mm_per_unit
-        self._records: list[dict[str, Any]] = []
+        self._records: list[_MapRecord] = []
 
     def add(self, dense: DenseMap) -> None:
         """Writes the surface of a submap whose last keyframe is done; an empty one is a failed part of the run."""
-        made = {"map": dense.submap.id, "keyframes": len(dense.alignments), "aligned": len(dense.aligned)}
-        self._records.append({**made, "vertices": len(dense.vertices), "voxel": dense.voxel})
+        scale, counts = self._mm_per_unit, (len(dense.alignments), len(dense.aligned), len(dense.vertices))
+        seen = coverage_of(dense, self._coverage).scaled(scale or 1.0) if len(dense.triangles) else None
+        self._records.append(_MapRecord(dense.submap.id, *counts, dense.voxel, seen))
         name = f"map_{dense.submap.id:03d}"
         if not len(dense.triangles):
             self._run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
             return
-        scale = self._mm_per_unit
-        self._records[-1]["coverage"] = coverage_of(dense, self._coverage).scaled(scale or 1.0).record()
         replace(dense, unit="mm" if scale else dense.unit).write(self._run.folder / name, ("ply",), scale)
 
     def finish(self, played: Sequence[Played], model: str, rate: float | None, budget_ms: float) -> None:
@@ -39,20 +61,21 @@ class PlayedRun:
         for p in played:
             if p.unread:
                 run.fail(f"map_{p.map:03d}, keyframe {p.keyframe}", p.reason)
-        if not any(record["vertices"] for record in self._records):
+        if not any(record.vertices for record in self._records):
             reasons = [f"{p.keyframe}: {p.reason}" for p in played if p.reason]
             raise InputError(f"no keyframe of any map could be aligned; {'; '.join(reasons[:3])}")
         write_timings(played, run.folder / "timings.csv")
         (run.folder / "timings.png").write_bytes(timings_picture(played, budget_ms / 1000))
-        timings = time_spent(played, budget_ms / 1000)
+        spent = time_spent(played, budget_ms / 1000)
         unit = "mm" if self._mm_per_unit else "map units"
-        run.record.update(plain({"unit": unit, "checkpoint": model, "maps": self._records, "timings": timings}))
+        maps = [record.record() for record in self._records]
+        run.record.update(plain({"unit": unit, "checkpoint": model, "maps": maps, "timings": spent.record()}))
+        timings = spent.timings
+        assert timings is not None, "a surface has keyframes that were read"
         run.log(
-            f"{timings['share_in_budget']:.0%} of {timings['read']} keyframes within {budget_ms:g} ms; median ms: "
-            + ", ".join(f"{step} {figures['median_ms']:.1f}" for step, figures in timings["steps"].items())
-            + f"; without the network {timings['without_network']['median_ms']:.1f}"
+            f"{timings.share_in_budget:.0%} of {spent.read} keyframes within {budget_ms:g} ms; median ms: "
+            + ", ".join(f"{step} {figures.median_ms:.1f}" for step, figures in timings.steps.items())
+            + f"; without the network {timings.without_network.median_ms:.1f}"
         )
         if rate is not None:
-            run.log(
-                f"at {rate:g} keyframes per second, {timings['share_in_time']:.0%} were on the surface in that time"
-            )
+            run.log(f"at {rate:g} keyframes per second, {timings.share_in_time:.0%} were on the surface in that time")

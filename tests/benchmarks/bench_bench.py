@@ -26,7 +26,7 @@ from densify.alignment import AlignmentConfig
 from densify.bench.record import BenchFile, record
 from densify.bench.scenes import scenes
 from densify.bench.verdict import OTHER_COLONS, SAME_COLONS, Comparison, Judged, compare, compared_value
-from densify.bench.work import BenchConfig, Predicted, load_models, predicted, run_scene
+from densify.bench.work import BenchConfig, CellFigures, Predicted, load_models, predicted, run_scene
 
 FIRST, TIMES, HEAVY = int(os.environ.get("LIGHTDEPTH_FIRST_SEED", 400)), 10, 0.45
 CONFIG = BenchConfig()
@@ -38,14 +38,18 @@ WORSE = replace(
 _Cells = dict[str, list[dict[str, Any]]]
 
 
+def _records(cells: Sequence[CellFigures]) -> list[dict[str, Any]]:
+    return [cell.record() for cell in cells]
+
+
 def _of_colon(first: int, place: int, models: Sequence[Any]) -> _Cells:
     """Cells of one colon as they are, with the worse setting (sets A), and with another draw of the SLAM's noise."""
     scene = predicted(scenes("small", first)[place], CONFIG.image_size, models)
     redrawn = replace(scene.rendered, scene=replace(scene.rendered.scene, seed=scene.rendered.scene.seed + 10_000))
     return {
-        "as it is": run_scene(scene, CONFIG),
-        "worse": run_scene(scene, WORSE) if (first - FIRST) % 4 == 0 else [],
-        "redrawn": run_scene(Predicted(redrawn, scene.predictions), CONFIG) if FIRST < 400 else [],
+        "as it is": _records(run_scene(scene, CONFIG)),
+        "worse": _records(run_scene(scene, WORSE)) if (first - FIRST) % 4 == 0 else [],
+        "redrawn": _records(run_scene(Predicted(redrawn, scene.predictions), CONFIG)) if FIRST < 400 else [],
     }
 
 

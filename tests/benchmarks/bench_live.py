@@ -91,7 +91,7 @@ def test_a_keyframe_is_on_the_surface_in_200_ms(seed):
     found = simulate_slam(sequence.frames, SlamConfig(keyframe_every=1, maps=1, points_per_keyframe=30), seed)
     frames = FrameSequence([f.name for f in sequence.frames], sequence.frames.__getitem__, "rendered")
     played = play(frames, found.map, load_model(DEFAULT_CHECKPOINT, details=False), LIVE, lambda _: None)
-    figures = time_spent(played, 0.2)
+    figures = time_spent(played, 0.2).record()
     observed = np.median([len(k.point_ids) for k in found.map.submaps[0].keyframes])
     print(
         f"\nseed {seed}: {len(played)} keyframes, {observed:.0f} points each, load {os.getloadavg()[0]:.1f}, "

@@ -14,7 +14,8 @@ from sfm_videos import video
 from densify.evaluation.errors import rms_ate
 from densify.similarity import fit_similarity
 from lightdepth.errors import InputError
-from lightdepth.sfm.reconstruction import SfmConfig, SfmMap, sparse_map_from_frames
+from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.reconstruction import SfmMap, sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
 from lightdepth.tube import lens
 
