@@ -85,7 +85,8 @@ class Coverage:
 def triangle_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     from trimesh.triangles import area  # not at the top: trimesh takes half a second, which live surfaces do not need
 
-    return area(vertices[triangles])
+    result: np.ndarray = area(vertices[triangles])  # type: ignore[no-untyped-call]  # trimesh has no annotation for it
+    return result
 
 
 def seen_well(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> np.ndarray:
@@ -205,7 +206,8 @@ def _vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     from trimesh.geometry import mean_vertex_normals
     from trimesh.triangles import cross
 
-    return mean_vertex_normals(len(vertices), triangles, cross(vertices[triangles]))
+    result: np.ndarray = mean_vertex_normals(len(vertices), triangles, cross(vertices[triangles]))  # type: ignore[no-untyped-call]  # trimesh has no annotation for it
+    return result
 
 
 def patches(triangles: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:

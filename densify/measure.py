@@ -140,7 +140,7 @@ def path(wall: Wall, start: np.ndarray, end: np.ndarray) -> Way:
 
 def _nearest(wall: Wall, triangle: int, point: np.ndarray) -> int:
     corners = wall.triangles[triangle]
-    return corners[np.linalg.norm(wall.vertices[corners] - point, axis=1).argmin()]
+    return int(corners[np.linalg.norm(wall.vertices[corners] - point, axis=1).argmin()])
 
 
 def _tightened(wall: Wall, points: np.ndarray, coarsest: float = 8.0, rounds: int = 60) -> np.ndarray:
@@ -259,7 +259,8 @@ def places_in_frame(dense: DenseMapFiles, frame: int, pixels: np.ndarray) -> np.
     for what, bad in (("is outside the image", ~inside), ("sees no surface", ~np.isfinite(distance))):
         if bad.any():
             raise InputError(f"frame {frame}: pixel {pixels[bad][0].tolist()} {what}")
-    return pose[:3, 3] + distance[:, None] * (rays @ pose[:3, :3].T)
+    result: np.ndarray = pose[:3, 3] + distance[:, None] * (rays @ pose[:3, :3].T)
+    return result
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,8 @@ def as_yaml(parser: ArgumentParser, config: Namespace) -> str:
     kept = config.clone()
     for key in ("config", "preset", "output", "resume", "overwrite"):
         kept.pop(key, None)
-    return parser.dump(kept, skip_validation=True)
+    result: str = parser.dump(kept, skip_validation=True)
+    return result
 
 
 def _with_own_config(argv: list[str]) -> list[str]:

@@ -113,14 +113,14 @@ class FrameDataModule(pl.LightningDataModule):
         self.sequences, self.val_sequences = config.sequences or [], config.val_sequences or []
         self.size, self.batch_size = (int(config.size[0]), int(config.size[1])), config.batch_size
         check_apart(self.sequences, self.val_sequences)
-        self._train: ConcatDataset | None = None
-        self._val: ConcatDataset | None = None
+        self._train: ConcatDataset[FrameBatch] | None = None
+        self._val: ConcatDataset[FrameBatch] | None = None
 
     def setup(self, stage: str | None = None) -> None:
         if self._train is not None:
             return
-        train: list[Dataset] = []
-        val: list[Dataset] = []
+        train: list[Dataset[FrameBatch]] = []
+        val: list[Dataset[FrameBatch]] = []
         to_train, to_validate = self._folders()
         opened = [(path, open_listed(self.config.source, path, of)) for path, of in to_train]
         rows = [list(range(len(frames))) for _, frames in opened]
@@ -182,8 +182,8 @@ class FrameDataModule(pl.LightningDataModule):
         self.sequences, self.val_sequences = ([path for path, _ in part] for part in both)
         return both
 
-    def _colons(self, seeds: range, bar: Progress) -> list[Dataset]:
-        made: list[Dataset] = []
+    def _colons(self, seeds: range, bar: Progress) -> list[Dataset[FrameBatch]]:
+        made: list[Dataset[FrameBatch]] = []
         for i, seed in enumerate(seeds):
             frames = tube_scene(self.tube, seed, i, self.size)
             made.append(_Cached(frames, [f"colon {seed} frame {k}" for k in range(len(frames))]))
@@ -201,25 +201,25 @@ class FrameDataModule(pl.LightningDataModule):
         assert self._train is not None, "setup() first"
         order = self._order()
         order.set_epoch(epoch)
-        everyone = [name for part in self._train.datasets for name in part.names]  # type: ignore[attr-defined]
+        everyone = [name for part in self._train.datasets for name in part.names]  # type: ignore[attr-defined]  # ours have
         first = batch * self.batch_size
         return [everyone[i] for i in list(order)[first : first + self.batch_size]]
 
     def _order(self) -> Shuffled:
         assert self._train is not None
-        colons = sum(len(part) for part in self._train.datasets if isinstance(part, _Cached))  # type: ignore[arg-type]
+        colons = sum(len(part) for part in self._train.datasets if isinstance(part, _Cached))
         frames = len(self._train) - colons
         if self.config.halves and frames and colons:
             return Halves(frames, colons, self.batch_size, self.config.seed)
         return Shuffled(len(self._train), self.config.seed)
 
-    def train_dataloader(self) -> DataLoader:
+    def train_dataloader(self) -> DataLoader[FrameBatch]:
         assert self._train is not None
         sampler = self._order()
         full = len(self._train) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
         return self._loader(self._train, sampler, drop_last=full)
 
-    def val_dataloader(self) -> DataLoader:
+    def val_dataloader(self) -> DataLoader[FrameBatch]:
         assert self._val is not None
         return self._loader(self._val)
 
@@ -240,7 +240,9 @@ class FrameDataModule(pl.LightningDataModule):
             batch = with_reflectance(batch, drawn.to(batch.image.device))
         return batch
 
-    def _loader(self, dataset: Dataset, order: Shuffled | None = None, drop_last: bool = False) -> DataLoader:
+    def _loader(
+        self, dataset: Dataset[FrameBatch], order: Shuffled | None = None, drop_last: bool = False
+    ) -> DataLoader[FrameBatch]:
         return DataLoader(
             dataset,
             sampler=order,
@@ -279,7 +281,7 @@ def augmented(batch: FrameBatch, generator: torch.Generator) -> FrameBatch:
     return batch._replace(image=torch.where(brightness(batch.image) >= _WHITE, batch.image, exposed))
 
 
-class _Frames(Dataset):
+class _Frames(Dataset[FrameBatch]):
     """Frames read when asked for, at one size."""
 
     def __init__(self, frames: FrameSequence, size: tuple[int, int], path: str) -> None:
@@ -293,7 +295,7 @@ class _Frames(Dataset):
         return to_batch(self.frames[index], self.size)
 
 
-class _Cached(Dataset):
+class _Cached(Dataset[FrameBatch]):
     def __init__(self, batches: list[FrameBatch], names: list[str]) -> None:
         self.batches, self.names = batches, names
 

@@ -94,7 +94,8 @@ def question(kind: Kind, share: float, points: int, rng: np.random.Generator) ->
 
     def noisy(factor: np.ndarray) -> np.ndarray:
         error = rng.normal(0, np.hypot(_DEPTH_ERROR, _POINT_ERROR * b))
-        return scale * b * factor * (1 + error).clip(0.2)
+        result: np.ndarray = scale * b * factor * (1 + error).clip(0.2)
+        return result
 
     a, count = noisy(np.ones(points)), round(share * points)
     chance = b / b.sum() if kind == "depth" else None

@@ -74,7 +74,7 @@ class BenchFile(BaseModel):
 
 def record(config: BenchConfig, cells: Sequence[Mapping[str, object]], seconds: Mapping[str, float]) -> dict[str, Any]:
     """What bench.json says. All but `seconds` is the same when made twice."""
-    return plain(
+    result: dict[str, Any] = plain(
         {
             "kind": "bench",
             "suite_version": SUITE_VERSION,
@@ -88,6 +88,7 @@ def record(config: BenchConfig, cells: Sequence[Mapping[str, object]], seconds: 
             "seconds": seconds,
         }
     )
+    return result
 
 
 def read_bench(path: Path) -> BenchFile:

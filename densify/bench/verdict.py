@@ -136,7 +136,7 @@ class Comparison:
 
 
 def _together(verdicts: Sequence[Verdict]) -> Verdict:
-    return next((v for v in ("worse", "better") if v in verdicts), "within noise")  # type: ignore[return-value]
+    return next((v for v in ("worse", "better") if v in verdicts), "within noise")
 
 
 def compare(a: BenchFile, b: BenchFile, seed: int = 0) -> Comparison:
@@ -225,7 +225,8 @@ def bootstrapped_mean(
     moderated = (weight * spread**2 + ((d - d.mean()) ** 2).sum()) / freedom
     drawn = d[rng.integers(n, size=(draws, n))].mean(1)
     missing = moderated * freedom / rng.chisquare(freedom, draws) - d.var()
-    return drawn + np.sqrt(np.maximum(missing, 0) / n) * rng.standard_normal(draws)
+    result: np.ndarray = drawn + np.sqrt(np.maximum(missing, 0) / n) * rng.standard_normal(draws)
+    return result
 
 
 def _changed(a: Mapping[str, Any], b: Mapping[str, Any], above: str = "") -> dict[str, tuple[Any, Any]]:

@@ -20,8 +20,8 @@ from densify.bench.estimators import (
 from densify.bench.record import notes, read_bench, record, tables
 from densify.bench.scenes import Size, scenes
 from densify.bench.verdict import compare
-from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, CellFigures, Recipe, load_models, predicted, run_scene
-from densify.config import DensifyConfig, OfflineConfig
+from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, CellFigures, load_models, predicted, run_scene
+from densify.config import DensifyConfig, OfflineConfig, Recipe
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group

@@ -29,7 +29,8 @@ CUBE_MM = 0.2
 
 def ate(source: np.ndarray, target: np.ndarray, similarity: Similarity) -> np.ndarray:
     """Distance (n,) of camera centres (n, 3) after alignment."""
-    return np.linalg.norm(similarity.apply(source) - target, axis=1)
+    result: np.ndarray = np.linalg.norm(similarity.apply(source) - target, axis=1)
+    return result
 
 
 def rms_ate(source: np.ndarray, target: np.ndarray, similarity: Similarity) -> float:
@@ -59,7 +60,8 @@ def closest(points: np.ndarray, tree: cKDTree) -> np.ndarray:
     """Distance (n,) from each point (n, 3) to the closest point of the tree. Raises InputError without points."""
     if not len(points):
         raise InputError("the model has no points")
-    return tree.query(points, workers=-1)[0]
+    result: np.ndarray = tree.query(points, workers=-1)[0]
+    return result
 
 
 def thinned(points: np.ndarray, cube: float) -> np.ndarray:
@@ -77,7 +79,8 @@ def thinned(points: np.ndarray, cube: float) -> np.ndarray:
     key = (x << 42) | (y << 21) | z
     order = np.lexsort((off, key))
     first = np.concatenate([[True], np.diff(key[order]) > 0])
-    return points[order[first]]
+    result: np.ndarray = points[order[first]]
+    return result
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from lightdepth.reporting.run import git_revision, plain, versions
 
 def with_versions(record: Mapping[str, Any]) -> dict[str, Any]:
     """The figures with what they were computed by. No time: the same work gives the same file."""
-    return plain({**record, "versions": versions(), "revision": git_revision()})
+    result: dict[str, Any] = plain({**record, "versions": versions(), "revision": git_revision()})
+    return result
 
 
 # Surfaces

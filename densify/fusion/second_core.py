@@ -44,7 +44,7 @@ def halves(function: Callable[[int, int], object], count: int) -> None:
 
 @cache
 def _helper() -> ThreadPoolExecutor | None:
-    threads = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    threads = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set at run time
     return ThreadPoolExecutor(1, "second core") if threads > 1 else None
 
 

@@ -17,7 +17,10 @@ from lightdepth.camera import CameraModel
 def ray_grid(camera: CameraModel, stride: int) -> np.ndarray:
     """Unit rays (n, 3) of a grid of the camera's pixels."""
     rays, valid = camera.rays()
-    return rays[stride // 2 :: stride, stride // 2 :: stride][valid[stride // 2 :: stride, stride // 2 :: stride]]
+    result: np.ndarray = rays[stride // 2 :: stride, stride // 2 :: stride][
+        valid[stride // 2 :: stride, stride // 2 :: stride]
+    ]
+    return result
 
 
 def surfaces_agree(target: Side, source: Side, similarity: Similarity) -> Agreement | None:

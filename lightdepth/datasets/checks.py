@@ -249,7 +249,7 @@ READINGS: dict[str, Reading] = {
     **{f"with the translations {text}": Reading(_scaled(factor), _same) for factor, text in _UNITS.items()},
     **{
         f"{INVERSE}, and the translations {text}": Reading(
-            lambda pose, factor=factor: np.linalg.inv(_scaled(factor)(pose)),  # type: ignore[misc]
+            lambda pose, factor=factor: np.linalg.inv(_scaled(factor)(pose)),  # type: ignore[misc]  # bound in the loop
             _same,
         )
         for factor, text in _UNITS.items()

@@ -73,7 +73,7 @@ def checked(submap: Submap, where: Path) -> Submap:
 def _whisper_half_a_pixel(submap: Submap, where: Path, median: float) -> None:
     """Warns when the keypoints fit clearly better half a pixel away, towards the other convention."""
     for shift in (0.5, -0.5):
-        moved = reprojection(_each(lambda k, by=shift: replace(k, pixels=k.pixels + by))(submap))[0]  # type: ignore[misc]
+        moved = reprojection(_each(lambda k, by=shift: replace(k, pixels=k.pixels + by))(submap))[0]  # type: ignore[misc]  # bound in the loop
         if moved < _HALF_A_PIXEL * median:
             warnings.warn(
                 f"{where}: median reprojection error {median:.2f} px, but {moved:.2f} px with {shift:+g} px on the "

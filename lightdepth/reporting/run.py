@@ -150,8 +150,8 @@ def git_revision() -> str | None:
         return None
     try:
         call = {"cwd": root, "capture_output": True, "text": True, "timeout": 10, "check": True}
-        revision = subprocess.run(["git", "rev-parse", "HEAD"], **call).stdout.strip()  # type: ignore[call-overload]
-        changed = subprocess.run(["git", "status", "--porcelain", "-uno"], **call).stdout.strip()  # type: ignore[call-overload]
+        revision = subprocess.run(["git", "rev-parse", "HEAD"], **call).stdout.strip()  # type: ignore[call-overload]  # options by name
+        changed = subprocess.run(["git", "status", "--porcelain", "-uno"], **call).stdout.strip()  # type: ignore[call-overload]  # options by name
     except (OSError, subprocess.SubprocessError):
         return None
     result: str | None = revision + ("+" if changed else "")

@@ -96,7 +96,8 @@ def usable_pixels(frame: Frame, config: SfmConfig) -> np.ndarray:
         return cv2.dilate(pixels.astype(np.uint8), shape) > 0
 
     highlight = frame.image.min(-1) >= config.highlight
-    return ~(grown(~frame.valid, config.mask_erosion_px) | grown(highlight, config.highlight_margin_px))
+    result: np.ndarray = ~(grown(~frame.valid, config.mask_erosion_px) | grown(highlight, config.highlight_margin_px))
+    return result
 
 
 def features_and_matches(

@@ -52,7 +52,8 @@ def vlad(descriptors: Sequence[np.ndarray], seed: int) -> np.ndarray:
 
 def _rooted(descriptors: np.ndarray) -> np.ndarray:
     found = np.asarray(descriptors, np.float32).reshape(-1, 128)
-    return np.sqrt(found / found.sum(1, keepdims=True).clip(min=1e-9))
+    result: np.ndarray = np.sqrt(found / found.sum(1, keepdims=True).clip(min=1e-9))
+    return result
 
 
 def _words(rooted: Sequence[np.ndarray], rng: np.random.Generator, rounds: int = 10, most: int = 20000) -> np.ndarray:
@@ -64,4 +65,5 @@ def _words(rooted: Sequence[np.ndarray], rng: np.random.Generator, rounds: int =
     words = sample[np.sort(rng.permutation(len(sample))[:WORDS])]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "One of the clusters is empty")  # its word stays where it was
-        return kmeans2(sample, words, iter=rounds, minit="matrix")[0]
+        result: np.ndarray = kmeans2(sample, words, iter=rounds, minit="matrix")[0]
+        return result

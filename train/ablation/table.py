@@ -134,11 +134,13 @@ class Line:
 
 def clear(differences: np.ndarray) -> np.ndarray:
     """Whether the mean over seeds (the first axis, at least two) is larger than the spread."""
-    return (len(differences) > 1) & (np.abs(differences.mean(0)) > np.ptp(differences, axis=0))
+    result: np.ndarray = (len(differences) > 1) & (np.abs(differences.mean(0)) > np.ptp(differences, axis=0))
+    return result
 
 
 def _overall(ratios: np.ndarray) -> np.ndarray:
-    return np.exp(np.log(ratios).mean((-2, -1)))
+    result: np.ndarray = np.exp(np.log(ratios).mean((-2, -1)))
+    return result
 
 
 def lines(table: Table) -> list[Line]:

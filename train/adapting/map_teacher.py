@@ -156,7 +156,8 @@ def _gap(log_d: Tensor, mask: Tensor, rays: Tensor, keyframes: Sequence[TaughtKe
     places = np.where(seen[:, None], pixels / (camera.width, camera.height), -1.0)
     there, known = _at(log_d[j], mask[j], places)
     gap = points[torch.as_tensor(known, device=log_d.device)].norm(dim=1).clamp(min=1e-9).log() - there
-    return gap[gap.detach().abs() < _MAX_GAP]
+    result: Tensor = gap[gap.detach().abs() < _MAX_GAP]
+    return result
 
 
 def _at(image: Tensor, mask: Tensor, places: np.ndarray) -> tuple[Tensor, np.ndarray]:

@@ -141,7 +141,8 @@ def epipolar_inliers(one: np.ndarray, other: np.ndarray, angle: float) -> np.nda
     essential = essential[:3]
     lines = np.linalg.norm(one @ essential.T, axis=1), np.linalg.norm(other @ essential, axis=1)
     off = np.abs(np.einsum("ni,ij,nj->n", other, essential, one))
-    return off < np.sin(tolerance) * np.minimum(*lines)
+    result: np.ndarray = off < np.sin(tolerance) * np.minimum(*lines)
+    return result
 
 
 class OrientationDescriptor:
@@ -292,7 +293,8 @@ def _shrunk(mask: np.ndarray, border: float) -> np.ndarray:
 def _cells(pixels: np.ndarray, camera: CameraModel) -> np.ndarray:
     """The grid's cell (n,) of pixels (n, 2)."""
     column, row = np.clip(pixels / (camera.width, camera.height) * _CELLS, 0, _CELLS - 1).astype(int).T
-    return row * _CELLS + column
+    result: np.ndarray = row * _CELLS + column
+    return result
 
 
 def _cells_in_view(frame: Frame) -> int:
