@@ -63,10 +63,12 @@ class AlignmentConfig:
     def __post_init__(self) -> None:
         if self.estimator not in get_args(Estimator):
             raise InputError(
-                f"alignment.estimator {self.estimator!r}; expected one of {', '.join(get_args(Estimator))}"
+                "alignment.estimator",
+                f"{self.estimator!r} is not known",
+                f"expected one of {', '.join(get_args(Estimator))}",
             )
         if not self.t > 0:
-            raise InputError(f"alignment.t {self.t}; expected a positive number of sigmas, such as 2.5")
+            raise InputError("alignment.t", f"{self.t}", "expected a positive number of sigmas, such as 2.5")
 
 
 @dataclass(frozen=True, repr=False)

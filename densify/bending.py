@@ -38,11 +38,12 @@ class BendingConfig:
 
     def __post_init__(self) -> None:
         if any(n < 2 for n in self.grids):
-            raise InputError(f"bending.grids {list(self.grids)}; expected at least 2 bumps across and down")
+            raise InputError("bending.grids", f"{list(self.grids)}", "expected at least 2 bumps across and down")
         if self.slope_deviation < 0 or not self.bump_deviation > 0:
             raise InputError(
-                f"bending: slope_deviation {self.slope_deviation}, bump_deviation {self.bump_deviation}; expected "
-                "at least 0 (no slope) and above 0"
+                "bending",
+                f"slope_deviation {self.slope_deviation}, bump_deviation {self.bump_deviation}",
+                "expected at least 0 (no slope) and above 0",
             )
 
     @property

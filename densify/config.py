@@ -92,12 +92,14 @@ class DensifyConfig(OfflineConfig):
 
     def __post_init__(self) -> None:
         if not 0 <= self.withhold < 1:
-            raise InputError(f"withhold {self.withhold}; expected a share of at least 0 and below 1")
+            raise InputError("withhold", f"{self.withhold}", "expected a share of at least 0 and below 1")
         if self.recipe not in ("full", "paper"):
-            raise InputError(f"recipe {self.recipe!r}; expected full or paper")
+            raise InputError("recipe", f"{self.recipe!r} is not known", "expected full or paper")
         unused = [name for name, left_out in vars(_LEFT_OUT).items() if getattr(self, name) != left_out]
         if self.recipe == "paper" and unused:
-            raise InputError(f"recipe paper: it has no {unused[0]}; leave out its settings, or take the recipe full")
+            raise InputError(
+                "recipe paper", f"it has no {unused[0]}", "leave out its settings, or take the recipe full"
+            )
 
     def under(self, recipe: Recipe) -> DensifyConfig:
         """The same settings under a recipe, less those that it has no use for."""

@@ -142,7 +142,7 @@ class DenseMap(Brief):
 
         folder = Path(folder)
         if folder.exists():
-            raise InputError(f"{folder}: already there; choose another folder")
+            raise InputError(folder, "already there", "choose another folder")
         folder.mkdir(parents=True)
         scale = mm_per_unit or 1.0
         rgba = np.concatenate([np.rint(self.colors * 255), np.full((len(self.colors), 1), 255)], 1).astype(np.uint8)
@@ -235,10 +235,10 @@ def read_dense_map(folder: str | Path) -> DenseMapFiles:
     folder = Path(folder)
     for name in ("mesh.ply", "sparse.ply", "trajectory.tum", "camera.json"):
         if not (folder / name).is_file():
-            raise InputError(f"{folder}: {name} missing; expected a map folder of a `lightdepth densify` run")
+            raise InputError(folder, f"{name} missing", "expected a map folder of a `lightdepth densify` run")
     map_id = folder.name.removeprefix("map_").removeprefix("joined_")
     if not (map_id.isascii() and map_id.isdigit()):
-        raise InputError(f"{folder}: expected a name such as map_000 or joined_000, with the number of the map")
+        raise InputError(folder, "no number of a map in its name", "expected a name such as map_000 or joined_000")
     mesh, cloud = _read_ply(folder / "mesh.ply"), _read_ply(folder / "sparse.ply")
     triangles = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), int)
     numbers, poses = read_tum(folder / "trajectory.tum")
@@ -265,4 +265,4 @@ def _read_ply(path: Path) -> Any:
     try:
         return trimesh.load(path, process=False)
     except (ValueError, KeyError, IndexError, OSError) as error:
-        raise InputError(f"{path}: damaged, or not a PLY file ({error})") from error
+        raise InputError(path, f"damaged, or not a PLY file ({error})", "copy it again") from error

@@ -82,7 +82,9 @@ class Densified:
         made = [r for r in self.results if len(r.dense.triangles)]
         if not made:
             reasons = [f"{a.keyframe}: {a.reason}" for r in self.results for a in r.dense.alignments if not a.ok]
-            raise InputError(f"no keyframe of any map could be aligned; {'; '.join(reasons[:3])}")
+            raise InputError(
+                "the maps", "no keyframe of any could be aligned", f"begin with the first: {'; '.join(reasons[:3])}"
+            )
         constant = {b.dense.submap.id: b for b in self.baselines}
         records = []
         for result in self.results:

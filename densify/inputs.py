@@ -46,7 +46,7 @@ def map_and_frames(
 def check_unit(mm_per_unit: float | None) -> None:
     """Raises InputError for millimetres per map unit that cannot be."""
     if mm_per_unit is not None and not mm_per_unit > 0:
-        raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
+        raise InputError("--mm-per-unit", f"{mm_per_unit}", "expected a positive number of millimetres")
 
 
 def made_sparse(

@@ -77,7 +77,7 @@ class JudgingConfig:
     def __post_init__(self) -> None:
         check_unit(self.mm_per_unit)
         if not self.thresholds_mm or not all(t > 0 for t in self.thresholds_mm):
-            raise InputError(f"--thresholds-mm {list(self.thresholds_mm)}; expected positive distances in mm")
+            raise InputError("--thresholds-mm", f"{list(self.thresholds_mm)}", "expected positive distances in mm")
 
 
 @dataclass(frozen=True)
@@ -112,16 +112,22 @@ def read_asked(
     """Raises InputError where the options do not go together. `in_place` is whether the metrics go into the run."""
     truth = source.truth
     if not run.exists():
-        raise InputError(f"{run}: no such folder or file")
+        raise InputError(run, "no such folder or file", "expected a run, predictions, a map or a trajectory")
     if in_place and not is_made_by_us(run):
-        raise InputError(f"{run}: not a folder of this program; add -o FOLDER for the metrics")
+        raise InputError(run, "not a folder of this program", "add -o FOLDER for the metrics")
     if truth is None and join is None and not withheld_errors(run):
         raise InputError(
-            "nothing to evaluate against: give --truth DATA, or --join FILE for the gap between two submaps (only a "
-            "densify run with withheld points has figures without either)"
+            "--truth",
+            "nothing to evaluate against",
+            "give --truth DATA, or --join FILE for the gap between two submaps (only a densify run with withheld "
+            "points has figures without either)",
         )
     if suite is not None and (truth is None or trajectory or source.truth_mesh or join):
-        raise InputError("--suite needs --truth, and goes with neither --trajectory, --truth-mesh nor --join")
+        raise InputError(
+            "--suite",
+            "without --truth, or with --trajectory, --truth-mesh or --join",
+            "it needs --truth, and goes with none of these",
+        )
     if truth is None:
         return Asked(run, source, config, trajectory)
     if suite is None:
@@ -165,7 +171,9 @@ def judge_asked(asked: Asked, model: DepthModel | None, out: Run) -> Answer:
                 raise
             out.fail(name, str(error))
     if asked.suite and not found:
-        raise InputError(f"no sequence could be judged; the first: {out.record['failures'][0]['reason']}")
+        raise InputError(
+            "the sequences", "none could be judged", f"begin with the first: {out.record['failures'][0]['reason']}"
+        )
     return Answer(found, withheld)
 
 

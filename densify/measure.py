@@ -31,7 +31,7 @@ class Wall:
 
     def __post_init__(self) -> None:
         if not len(self.triangles):
-            raise InputError("the surface has no triangles; there is nothing to measure on")
+            raise InputError("the surface", "it has no triangles", "there is nothing to measure on: choose another map")
 
     @cached_property
     def surface(self) -> Surface:
@@ -110,8 +110,9 @@ def on_wall(wall: Wall, points: np.ndarray, reach: float = 5.0) -> np.ndarray:
     if (off > reach * wall.step).any():
         worst = int(off.argmax())
         raise InputError(
-            f"point {np.round(points[worst], 4).tolist()} is {off[worst]:.3g} from the surface, whose resolution is "
-            f"{wall.step:.2g}; the nearest place on it is {np.round(found[worst], 4).tolist()}"
+            f"point {np.round(points[worst], 4).tolist()}",
+            f"it is {off[worst]:.3g} from the surface, whose resolution is {wall.step:.2g}",
+            f"the nearest place on it is {np.round(found[worst], 4).tolist()}",
         )
     return found
 
@@ -124,8 +125,9 @@ def path(wall: Wall, start: np.ndarray, end: np.ndarray) -> Way:
     distance, before = dijkstra(wall.graph, directed=False, indices=first, return_predecessors=True)
     if not np.isfinite(distance[last]):
         raise InputError(
-            "there is no way along the surface between the two points: they lie on parts that do not touch; the "
-            f"straight distance is {np.linalg.norm(end - start):.4g}"
+            "the two points",
+            "there is no way along the surface between them: they lie on parts that do not touch",
+            f"the straight distance is {np.linalg.norm(end - start):.4g}",
         )
     chain = [last]
     while chain[-1] != first:
@@ -180,7 +182,7 @@ def patch(wall: Wall, corners: np.ndarray) -> Area:
     middle = outline.mean(0)
     _, extent, axes = np.linalg.svd(outline - middle, full_matrices=False)
     if extent[1] < 0.01 * extent[0]:
-        raise InputError(f"the {len(corners)} corners lie on a line; an area needs corners around it")
+        raise InputError(f"the {len(corners)} corners", "they lie on a line", "an area needs corners around it")
     flat = (outline - middle) @ axes[:2].T
     reach = np.linalg.norm(outline - middle, axis=1).max()
     near = np.linalg.norm(wall.vertices - middle, axis=1) < 1.5 * reach
@@ -224,10 +226,10 @@ def chosen_map(maps: Sequence[DenseMapFiles], wanted: int | None, run: Path) -> 
     """The map of that number, or the only one. Raises InputError where there is none, or no telling which."""
     ids = [m.id for m in maps]
     if wanted is None and len(maps) > 1:
-        raise InputError(f"{run}: it has maps {ids}, each in a frame of its own; say which by --map")
+        raise InputError(run, f"it has maps {ids}, each in a frame of its own", "say which by --map")
     found = [m for m in maps if wanted in (None, m.id)]
     if not found:
-        raise InputError(f"{run}: no map {wanted}; it has {ids}")
+        raise InputError(run, f"no map {wanted}", f"it has {ids}")
     return found[0]
 
 
@@ -240,9 +242,9 @@ def run_unit(run: Path, mm_per_unit: float | None) -> str:
     if mm_per_unit is None:
         return unit
     if not mm_per_unit > 0 or not np.isfinite(mm_per_unit):
-        raise InputError(f"--mm-per-unit {mm_per_unit}; expected a positive number of millimetres")
+        raise InputError("--mm-per-unit", f"{mm_per_unit}", "expected a positive number of millimetres")
     if unit == "mm":
-        raise InputError(f"{run}: its surfaces are in mm already; leave --mm-per-unit out")
+        raise InputError(run, "its surfaces are in mm already", "leave --mm-per-unit out")
     return "mm"
 
 
@@ -251,14 +253,16 @@ def places_in_frame(dense: DenseMapFiles, frame: int, pixels: np.ndarray) -> np.
     row = np.flatnonzero(dense.numbers == frame)
     if not len(row):
         near = dense.numbers[np.abs(dense.numbers - frame).argmin()]
-        raise InputError(f"map {dense.id}: frame {frame} is no keyframe of it; the nearest is {near}")
+        raise InputError(f"map {dense.id}", f"frame {frame} is no keyframe of it", f"the nearest is {near}")
     pose = dense.map_from_cam[row[0]]
     rays, valid = dense.camera.unproject(pixels)
     inside = valid & (pixels >= 0).all(1) & (pixels <= (dense.camera.width, dense.camera.height)).all(1)
     distance = Surface(dense.vertices, dense.triangles).cast(pose[:3, 3], rays @ pose[:3, :3].T)
     for what, bad in (("is outside the image", ~inside), ("sees no surface", ~np.isfinite(distance))):
         if bad.any():
-            raise InputError(f"frame {frame}: pixel {pixels[bad][0].tolist()} {what}")
+            raise InputError(
+                f"frame {frame}", f"pixel {pixels[bad][0].tolist()} {what}", "choose a pixel that shows the surface"
+            )
     result: np.ndarray = pose[:3, 3] + distance[:, None] * (rays @ pose[:3, :3].T)
     return result
 
@@ -312,14 +316,15 @@ def measured(dense: DenseMapFiles, places: np.ndarray, radius: float | None = No
     `scale` multiplies lengths at the end; radius is in the scaled unit. Raises InputError for anything else.
     """
     if not np.isfinite(places).all():
-        raise InputError(f"places {places.tolist()}; expected finite numbers")
+        raise InputError("places", f"{places.tolist()}", "expected finite numbers")
     if (len(places) == 1) != (radius is not None):
         raise InputError(
-            f"{len(places)} places{'' if radius is None else ' and a radius'}; expected one place with a "
-            "radius, two places, or the three or more corners of an outline"
+            "places",
+            f"{len(places)}{'' if radius is None else ' and a radius'}",
+            "expected one place with a radius, two places, or the three or more corners of an outline",
         )
     if radius is not None and not (radius > 0 and np.isfinite(radius)):
-        raise InputError(f"--radius {radius}; expected a positive length")
+        raise InputError("--radius", f"{radius}", "expected a positive length")
     wall = Wall(dense.vertices, dense.triangles)
     places = on_wall(wall, places)
     found: Way | Area

@@ -44,11 +44,15 @@ def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = Tr
     Raises InputError when the points cannot fix it: fewer than three, or all on a line.
     """
     if len(source) < 3:
-        raise InputError(f"{len(source)} common poses; a similarity needs at least 3")
+        raise InputError("poses", f"{len(source)} in common", "expected at least 3: a similarity needs them")
     for name, points in (("map", source), ("true", target)):
         spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
         if spread[1] < 1e-3 * max(spread[0], 1e-300):
-            raise InputError(f"the {name} camera centres lie on a line (or in one place): the rotation cannot be found")
+            raise InputError(
+                f"{name} camera centres",
+                "they lie on a line (or in one place): the rotation cannot be found",
+                "give frames of a path that bends",
+            )
     scale, rotation, translation = umeyama(source, target, with_scale=with_scale)
     return Similarity(float(scale), rotation, translation)
 

@@ -48,17 +48,21 @@ def convert_camera(
     from scipy.optimize import least_squares
 
     if model_name not in CAMERA_MODELS:
-        raise InputError(f"camera model {model_name!r}; expected one of {', '.join(CAMERA_MODELS)}")
+        raise InputError("camera model", f"{model_name!r} is not known", f"expected one of {', '.join(CAMERA_MODELS)}")
     model = CAMERA_MODELS[model_name]
     all_rays, seen = camera.rays()
     counted = seen if valid is None else valid & seen
     rows, columns = np.nonzero(counted)
     if not len(rows):
-        raise InputError("no valid pixel in the mask: no camera can be fitted to it; is the mask inverted?")
+        raise InputError("the mask", "no valid pixel in it: no camera can be fitted", "is it inverted?")
     rays, pixels = all_rays[rows, columns], np.stack([columns, rows], -1) + 0.5
     fitted = np.flatnonzero(rays[:, 2] > _PLANE_LIMIT) if model in (Pinhole, Brown) else np.arange(len(rays))
     if not len(fitted):
-        raise InputError(f"no valid pixel within 75 degrees of the axis: no {model_name} camera can be fitted")
+        raise InputError(
+            "the mask",
+            f"no valid pixel within 75 degrees of the axis: no {model_name} camera can be fitted",
+            "choose a fisheye model",
+        )
     fitted = fitted[:: max(1, len(fitted) // _FITTED)]
 
     start, scale = _start(camera, model, rays[fitted], pixels[fitted])
@@ -89,7 +93,7 @@ def convert_camera(
     found, rotation = candidate(solved.x)
     projected, both = found.project(rays @ rotation.T)
     if not both.any():
-        raise InputError(f"no {model_name} camera sees what this {camera.name} camera sees")
+        raise InputError(f"{camera.name} camera", f"no {model_name} camera sees what it sees", "choose another model")
     error = np.linalg.norm(projected - pixels, axis=1)[both]
     return Conversion(found, rotation, float(np.median(error)), float(error.max()), float(both.mean()))
 

@@ -64,12 +64,12 @@ def load_model(name_or_path: str | Path = DEFAULT_CHECKPOINT, details: bool = Tr
     if not path.is_file():
         known = ", ".join([*bundled(), *TRAINING_FREE])
         what = "is a folder" if path.is_dir() else "no such checkpoint"
-        raise InputError(f"{name}: {what}; expected a .safetensors or .ckpt file, or one of {known}")
+        raise InputError(name, what, f"expected a .safetensors or .ckpt file, or one of {known}")
     if path.suffix == ".safetensors":
         return _placed(_load_safetensors(path, path.stem, details))
     if path.suffix == ".ckpt":
         return _placed(_load_lightning(path, details))
-    raise InputError(f"{name}: unknown kind of checkpoint; expected a name that ends in .safetensors or .ckpt")
+    raise InputError(name, "unknown kind of checkpoint", "expected a name that ends in .safetensors or .ckpt")
 
 
 def _placed(model: NetworkModel) -> NetworkModel:
@@ -89,13 +89,13 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], NetworkConfig, dic
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
         config, card = json.loads(metadata["network"]), json.loads(metadata["card"])
     except (SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"{path}: damaged or not a safetensors file ({error})") from error
+        raise InputError(path, f"damaged or not a safetensors file ({error})", "copy it again") from error
     except KeyError as error:
         raise InputError(
-            f"{path}: metadata {error} missing; expected a checkpoint exported by `lightdepth train`"
+            path, f"metadata {error} missing", "expected a checkpoint exported by `lightdepth train`"
         ) from error
     if not isinstance(config, dict) or not isinstance(card, dict):
-        raise InputError(f"{path}: metadata is not two JSON objects; expected one exported by `lightdepth train`")
+        raise InputError(path, "metadata is not two JSON objects", "expected one exported by `lightdepth train`")
     return weights, NetworkConfig.from_dict(config), card
 
 
@@ -110,21 +110,25 @@ def _load_lightning(path: Path, details: bool) -> NetworkModel:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged or hostile pickle can raise anything; it is never executed
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise InputError(f"{path}: damaged, or holds more than weights and plain values ({first})") from error
+        raise InputError(
+            path,
+            f"damaged, or holds more than weights and plain values ({first})",
+            "expected a checkpoint written by `lightdepth train`",
+        ) from error
     try:
         hyper, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
         config = NetworkConfig.from_dict(dict(hyper["network"]))
         prefix = "network."
         weights = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
     except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: {error!r}; expected a checkpoint written by `lightdepth train`") from error
+        raise InputError(path, f"{error!r}", "expected a checkpoint written by `lightdepth train`") from error
     return NetworkModel(_network(config, weights, path), _rows(hyper, path), path.stem, {}, details)
 
 
 def _rows(found: dict[str, Any], path: Path) -> int:
     rows = found.get("rows", _DEFAULT_ROWS)
     if not isinstance(rows, int) or rows < 1:
-        raise InputError(f"{path}: rows {rows!r}; expected the image height to predict at, in pixels")
+        raise InputError(path, f"rows {rows!r}", "expected the image height to predict at, in pixels")
     return rows
 
 
@@ -132,10 +136,14 @@ def _network(config: NetworkConfig, weights: dict[str, Tensor], path: Path) -> D
     network = build_network(config)
     weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
     if not all(torch.isfinite(value).all() for value in weights.values()):
-        raise InputError(f"{path}: weights are not all finite")
+        raise InputError(path, "weights are not all finite", "its training failed: take an earlier checkpoint")
     try:
         network.load_state_dict(weights)
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1].strip()
-        raise InputError(f"{path}: weights do not fit a {config.kind} network ({reason})") from error
+        raise InputError(
+            path,
+            f"weights do not fit a {config.kind} network ({reason})",
+            "expected a checkpoint of this version of the program",
+        ) from error
     return network.requires_grad_(False).eval()

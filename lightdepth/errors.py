@@ -1,12 +1,35 @@
 """What a user can do wrong, told apart from what we did wrong.
 
-`InputError` is for the user's files and numbers: its message says what was found, where, and what would be right. The
+`InputError` is for the user's files and numbers: it says where, what was found there, and what would be right. The
 command line prints it without a traceback and exits with 3. Our own mistakes stay asserts.
 """
 
+from __future__ import annotations
+
+from pathlib import Path
+
 
 class InputError(ValueError):
-    """Input that cannot be used: missing, unreadable, or contradicting itself."""
+    """Input that cannot be used: missing, unreadable, or contradicting itself. Printed as `where: found; cure`."""
+
+    where: str
+    """The file, option or thing that it is about; a place inside it follows after a colon."""
+    found: str
+    """What was found there, with its value."""
+    cure: str
+    """What would be right, or what to do: `expected ...`, `give ...`, or a question that leads there."""
+
+    def __init__(self, where: str | Path, found: str, cure: str) -> None:
+        super().__init__(str(where), found, cure)  # all three in args: a copy or a pickle is made from them
+        self.where, self.found, self.cure = self.args
+        assert self.where and found and cure, "an InputError says where, what was found, and the cure"
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.found}; {self.cure}"
+
+    def within(self, outer: str | Path) -> InputError:
+        """The same error, told of a place inside `outer`, such as the file that the wrong number is in."""
+        return InputError(f"{outer}: {self.where}", self.found, self.cure)
 
 
 class PartialFailure(RuntimeError):

@@ -27,7 +27,9 @@ def frame_number(name: str) -> int:
     stem = re.sub(r"\.[A-Za-z]\w*$", "", stem)
     digits = re.findall(r"\d+", stem)
     if not digits:
-        raise InputError(f"{name}: no number in the name; frames are matched with map entries by the integer in it")
+        raise InputError(
+            name or "''", "no number in the name", "frames are matched with map entries by the integer in it"
+        )
     return int(digits[-1])
 
 
@@ -52,13 +54,14 @@ class Frame(Brief):
     def __post_init__(self) -> None:
         height, width = self.image.shape[:2]
         if self.image.ndim != 3 or self.image.shape[2] != 3:
-            raise InputError(f"{self.name}: image of shape {self.image.shape}; expected (H, W, 3)")
+            raise InputError(self.name, f"image of shape {self.image.shape}", "expected (H, W, 3)")
         check_image_size(self.name, width, height, self.camera)
         for what, array in (("mask", self.mask), ("true distance", self.true_distance)):
             if array is not None and array.shape != (height, width):
                 raise InputError(
-                    f"{self.name}: {what} is {array.shape[1]}x{array.shape[0]}, the image {width}x{height}; "
-                    "they must have the same size"
+                    self.name,
+                    f"{what} is {array.shape[1]}x{array.shape[0]}, the image {width}x{height}",
+                    "they must have the same size",
                 )
 
     @property
@@ -77,17 +80,20 @@ def check_image_size(name: str, width: int, height: int, camera: CameraModel) ->
     if (camera.width, camera.height) == (width, height):
         return
     sx, sy = width / camera.width, height / camera.height
-    found = f"{name}: the image is {width}x{height}, the camera {camera.width}x{camera.height}"
+    found = f"the image is {width}x{height}, the camera {camera.width}x{camera.height}"
     if (camera.width, camera.height) == (height, width) and width != height:
-        raise InputError(f"{found}: width and height are swapped in the calibration")
+        raise InputError(name, f"{found}: width and height are swapped in the calibration", "swap them there")
     if abs(sx / sy - 1) < 0.01:
         raise InputError(
-            f"{found}: ratio {sx:.4g}. If the image was only resized, rescale the camera: multiply fx, fy, cx, cy by "
-            f"{sx:.6g} and set width {width}, height {height} (CameraModel.resized does it)"
+            name,
+            f"{found}: ratio {sx:.4g}",
+            f"if the image was only resized, rescale the camera: multiply fx, fy, cx, cy by {sx:.6g} and set width "
+            f"{width}, height {height} (CameraModel.resized does it)",
         )
     raise InputError(
-        f"{found}: ratios {sx:.4g} in width and {sy:.4g} in height differ, so the image was cropped or padded; "
-        "give the calibration of this image format"
+        name,
+        f"{found}: ratios {sx:.4g} in width and {sy:.4g} in height differ, so the image was cropped or padded",
+        "give the calibration of this image format",
     )
 
 

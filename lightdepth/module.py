@@ -67,9 +67,11 @@ class LightDepth(pl.LightningModule):
         network = NetworkConfig.from_dict(network) if isinstance(network, dict) else network
         loss = LossConfig(**loss) if isinstance(loss, dict) else loss
         if schedule not in SCHEDULES:
-            raise InputError(f"schedule {schedule!r}; expected one of {', '.join(SCHEDULES)}")
+            raise InputError("schedule", f"{schedule!r} is not known", f"expected one of {', '.join(SCHEDULES)}")
         if not network.uncertainty and (loss.uncertainty > 0 or freeze_distance):
-            raise InputError("the loss trains an uncertainty head that the network has not; set network.uncertainty")
+            raise InputError(
+                "loss", "it trains an uncertainty head that the network has not", "set network.uncertainty"
+            )
         plain = {"learning_rate": learning_rate, "weight_decay": weight_decay, "schedule": schedule, "rows": rows}
         self.save_hyperparameters({"network": network.to_dict(), "loss": asdict(loss), **plain}, logger=False)
         self.loss_config = loss
@@ -156,13 +158,14 @@ class LightDepth(pl.LightningModule):
 
         model = load_model(checkpoint, details=False)
         if not isinstance(model, NetworkModel):
-            raise InputError(f"{checkpoint}: has no weights to start from; expected a trained checkpoint")
+            raise InputError(checkpoint, "has no weights to start from", "expected a trained checkpoint")
         ours, theirs = self.network.state_dict(), model.network.state_dict()
         body = {name for name in ours if name.startswith("body.")}
         fits = all(name in theirs and theirs[name].shape == ours[name].shape for name in body)
         if not fits or model.network.config.inputs != self.network.config.inputs:
             raise InputError(
-                f"{checkpoint}: is {model.network.config}, which does not fit {self.network.config}; "
-                "give the same kind, inputs, encoder and width"
+                checkpoint,
+                f"is {model.network.config}, which does not fit {self.network.config}",
+                "give the same kind, inputs, encoder and width",
             )
         self.network.load_state_dict({n: v.cpu() for n, v in theirs.items() if n in ours}, strict=False)

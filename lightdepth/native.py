@@ -47,7 +47,7 @@ def open3d() -> ModuleType:
     except (ImportError, OSError) as error:
         packages = " ".join(["libusb-1.0-0", *SYSTEM_LIBRARIES.values()])
         raise InputError(
-            f"Open3D cannot be loaded ({error}). On Debian or Ubuntu: apt-get install {packages}"
+            "Open3D", f"it cannot be loaded ({error})", f"on Debian or Ubuntu: apt-get install {packages}"
         ) from error
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
@@ -75,8 +75,9 @@ def warp() -> ModuleType:
         import warp
     except ImportError as error:
         raise InputError(
-            f"NVIDIA Warp, which casts rays on a GPU, cannot be loaded ({error}). Install it: pip install "
-            "'lightdepth[gpu]'; or render on the CPU"
+            "NVIDIA Warp, which casts rays on a GPU",
+            f"it cannot be loaded ({error})",
+            "install it: pip install 'lightdepth[gpu]'; or render on the CPU",
         ) from error
     warp.config.log_level = warp.LOG_ERROR  # or it greets, and warns where there is no GPU
     warp.init()  # type: ignore[no-untyped-call]  # Warp has no annotation for it

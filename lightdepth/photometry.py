@@ -46,21 +46,24 @@ class PhotometricCalibration:
     def __post_init__(self) -> None:
         if len(self.position_mm) != 3 or len(self.direction) != 3:
             raise InputError(
-                f"light: position_mm {self.position_mm}, direction {self.direction}; expected 3 numbers each"
+                "light", f"position_mm {self.position_mm}, direction {self.direction}", "expected 3 numbers each"
             )
         numbers = [self.gamma, self.mu, self.gain, self.reflectance, *self.position_mm, *self.direction]
         if not np.isfinite(numbers).all():
-            raise InputError("light: a value is not finite")
+            raise InputError("light", "a value is not finite", "expected numbers")
         if not 0.2 <= self.gamma <= 10:
-            raise InputError(f"light: gamma {self.gamma}; expected a response exponent between 0.2 and 10, usually 2.2")
+            raise InputError(
+                "light", f"gamma {self.gamma}", "expected a response exponent between 0.2 and 10, usually 2.2"
+            )
         if self.mu < 0 or self.gain <= 0 or not 0 <= self.reflectance < 1:
             raise InputError(
-                f"light: mu {self.mu}, gain {self.gain}, reflectance {self.reflectance}; "
-                "expected mu >= 0, gain > 0 and 0 <= reflectance < 1"
+                "light",
+                f"mu {self.mu}, gain {self.gain}, reflectance {self.reflectance}",
+                "expected mu >= 0, gain > 0 and 0 <= reflectance < 1",
             )
         length = float(np.linalg.norm(self.direction))
         if length == 0:
-            raise InputError("light: direction is zero; expected a vector into the scene such as [0, 0, 1]")
+            raise InputError("light", "direction is zero", "expected a vector into the scene such as [0, 0, 1]")
         object.__setattr__(self, "direction", tuple(float(v) / length for v in self.direction))
         object.__setattr__(self, "position_mm", tuple(map(float, self.position_mm)))
 

@@ -81,4 +81,6 @@ def read_prediction(path: str | Path) -> DepthPrediction:
             **arrays,
         )
     except _UNREADABLE as error:
-        raise InputError(f"{path}: not a prediction made by `lightdepth predict` ({error})") from error
+        raise InputError(
+            path, f"not a prediction ({error})", "expected an .npz made by `lightdepth predict`"
+        ) from error

@@ -54,8 +54,10 @@ class RefineConfig:
     def __post_init__(self) -> None:
         if self.steps < 0 or self.rows < 8 or self.levels < 1 or self.anchor < 0 or self.learning_rate <= 0:
             raise InputError(
-                f"refine: steps {self.steps}, rows {self.rows}, learning_rate {self.learning_rate}, "
-                f"levels {self.levels}, anchor {self.anchor}; expected at least 0, 8, above 0, 1 and 0"
+                "refine",
+                f"steps {self.steps}, rows {self.rows}, learning_rate {self.learning_rate}, levels {self.levels}, "
+                f"anchor {self.anchor}",
+                "expected at least 0, 8, above 0, 1 and 0",
             )
 
 

@@ -32,7 +32,11 @@ class Keyframe(Brief):
     def __post_init__(self) -> None:
         check_rigid(self.cam_from_map, f"keyframe {self.name}")
         if len(self.pixels) != len(self.point_ids):
-            raise InputError(f"keyframe {self.name}: {len(self.pixels)} keypoints, {len(self.point_ids)} point ids")
+            raise InputError(
+                f"keyframe {self.name}",
+                f"{len(self.pixels)} keypoints, {len(self.point_ids)} point ids",
+                "expected as many",
+            )
 
     @property
     def number(self) -> int:
@@ -63,20 +67,28 @@ class Submap(Brief):
 
     def __post_init__(self) -> None:
         if not len(self.points):
-            raise InputError(f"map {self.id} has no points")
+            raise InputError(f"map {self.id}", "it has no points", "expected at least one")
         if not self.keyframes:
-            raise InputError(f"map {self.id} has no keyframes")
+            raise InputError(f"map {self.id}", "it has no keyframes", "expected at least one")
         if len(self.points) != len(self.point_ids):
-            raise InputError(f"map {self.id}: {len(self.points)} points, {len(self.point_ids)} point ids")
+            raise InputError(
+                f"map {self.id}", f"{len(self.points)} points, {len(self.point_ids)} point ids", "expected as many"
+            )
         ids, counts = np.unique(self.point_ids, return_counts=True)
         if len(ids) < len(self.point_ids):
-            raise InputError(f"map {self.id}: point {ids[counts > 1][0]} is in it twice; a point's id must be unique")
+            raise InputError(
+                f"map {self.id}", f"point {ids[counts > 1][0]} is in it twice", "a point's id must be unique"
+            )
         if not np.isfinite(self.points).all():
             bad = self.point_ids[~np.isfinite(self.points).all(1)]
-            raise InputError(f"map {self.id}: {len(bad)} points are not finite, the first is point {bad[0]}")
+            raise InputError(
+                f"map {self.id}",
+                f"{len(bad)} points are not finite, the first is point {bad[0]}",
+                "expected finite X Y Z",
+            )
         twice = sorted(n for n, times in Counter(k.number for k in self.keyframes).items() if times > 1)
         if twice:
-            raise InputError(f"map {self.id}: frame {twice[0]} is in it twice; a keyframe's number must be unique")
+            raise InputError(f"map {self.id}", f"frame {twice[0]} is in it twice", "a keyframe's number must be unique")
 
     @cached_property
     def _rows_by_id(self) -> np.ndarray:
@@ -117,10 +129,10 @@ class SparseMap(Brief):
 
     def __post_init__(self) -> None:
         if not self.submaps:
-            raise InputError(f"{self.source}: no map in it")
+            raise InputError(self.source, "no map in it", "expected at least one")
         twice = sorted(i for i, times in Counter(s.id for s in self.submaps).items() if times > 1)
         if twice:
-            raise InputError(f"{self.source}: two maps have the id {twice[0]}; every submap needs its own")
+            raise InputError(self.source, f"two maps have the id {twice[0]}", "every submap needs its own")
 
 
 def covisibility(submap: Submap) -> np.ndarray:
@@ -140,25 +152,30 @@ def typical_distance(submap: Submap) -> float:
     distances = [np.linalg.norm(k.in_camera(submap.observed_points(k)[1]), axis=1) for k in submap.keyframes]
     together = np.concatenate(distances)
     if not len(together):
-        raise InputError(f"map {submap.id}: no keyframe observes any of its points; observations are needed")
+        raise InputError(
+            f"map {submap.id}", "no keyframe observes any of its points", "export the map with its observations"
+        )
     return float(np.quantile(together, 0.35))
 
 
 def check_rigid(transform: np.ndarray, what: str) -> None:
     """Raises InputError unless (4, 4) is a finite rotation and translation."""
     if transform.shape != (4, 4):
-        raise InputError(f"{what}: pose of shape {transform.shape}; expected (4, 4)")
+        raise InputError(what, f"pose of shape {transform.shape}", "expected (4, 4)")
     if not np.isfinite(transform).all():
-        raise InputError(f"{what}: the pose has NaN or infinite numbers; expected a rotation and a translation")
+        raise InputError(what, "the pose has NaN or infinite numbers", "expected a rotation and a translation")
     rotation = transform[:3, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if off > 1e-3 or np.linalg.det(rotation) < 0:
         raise InputError(
-            f"{what}: the pose is not a rotation and translation (R R^T is {off:.2g} from the identity, "
-            f"det {np.linalg.det(rotation):.3g}); is it scaled, or mirrored?"
+            what,
+            f"the pose is not a rotation and translation (R R^T is {off:.2g} from the identity, det "
+            f"{np.linalg.det(rotation):.3g})",
+            "is it scaled, or mirrored?",
         )
     if np.abs(transform[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise InputError(
-            f"{what}: the last row of the pose is {transform[3].tolist()}; expected [0, 0, 0, 1]. "
-            "Is it flattened column by column?"
+            what,
+            f"the last row of the pose is {transform[3].tolist()}",
+            "expected [0, 0, 0, 1]. Is it flattened column by column?",
         )

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 from colons import colon, slam
+from raising import refused
 from verbs import by_options
 
 from lightdepth.checkpoint import load_model, read_card, save_model
 from lightdepth.datasets import write_folder
-from lightdepth.errors import InputError, PartialFailure
+from lightdepth.errors import PartialFailure
 from lightdepth.frame import to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.maps import write_multimap
@@ -214,7 +215,7 @@ def test_an_exported_low_rank_model_is_a_plain_checkpoint(start, sequences, tmp_
 
 def test_only_what_is_named_counts_as_learning():
     assert let_learn(network(), "norms") < let_learn(network(), "decoder") < let_learn(network(), "all")
-    with pytest.raises(InputError, match="rank of at least 1"):
+    with refused(cure="rank of at least 1"):
         let_learn(network(), "low_rank", 0)
 
 
@@ -251,7 +252,7 @@ def test_replay_fills_the_second_half_of_every_batch_with_colons_of_the_source(s
         assert len({n for batch in names for n in batch[:2]}) == 8  # every frame once
     batches = list(data.train_dataloader())
     assert all(b.true_valid.flatten(1).any(1).tolist() == [False, False, True] for b in batches)
-    with pytest.raises(InputError, match="batch_size of at least 2"):
+    with refused(cure="batch_size of at least 2"):
         FrameDataModule(FrameData(halves=True, batch_size=1))
 
 
@@ -296,7 +297,7 @@ def test_the_loss_is_the_card_s_made_fit_for_frames_without_truth():
     [
         ({"checkpoint": "decline"}, "has no weights to adapt"),
         ({"steps": 0}, "expected positive numbers"),
-        ({"anchor": -1.0}, "anchor -1.0"),
+        ({"anchor": -1.0}, "anchor … -1.0"),
         ({"held_out": 1.0}, "a share above 0 and below 1"),
         ({"replay": 1, "batch_size": 1}, "batch_size of at least 2"),
         ({"data": Path("nowhere")}, "nowhere"),
@@ -306,7 +307,7 @@ def test_the_loss_is_the_card_s_made_fit_for_frames_without_truth():
 )
 def test_what_cannot_be_used_is_said_and_nothing_is_left_behind(start, sequences, tmp_path, options, said):
     arguments = {"data": sequences / "plain", "checkpoint": str(start), "size": SIZE, **options}
-    with pytest.raises(InputError, match=said):
+    with refused(said):
         adapt(output=tmp_path / "run", **arguments)
     assert not list(tmp_path.iterdir())
 
@@ -324,7 +325,7 @@ def test_a_map_that_teaches_keeps_quiet_about_the_frames_that_judge(start, seque
 
 
 def test_a_map_cannot_teach_what_it_has_to_judge(start, sequences, tmp_path):
-    with pytest.raises(InputError, match=r"too few of its keyframes are held-out frames .* raise --held-out"):
+    with refused(found="too few of its keyframes are held-out frames", cure="raise --held-out"):
         adapted(start, sequences / "unlit", tmp_path / "run", map=sequences / "slam", points=1.0)
-    with pytest.raises(InputError, match=r"--points 1.0, --overlap 0.0 without --map"):
+    with refused(where="--points, --overlap", found="1.0, 0.0 without --map"):
         adapted(start, sequences / "unlit", tmp_path / "run", points=1.0)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from colons import CAMERA
+from raising import refused
 
 from densify.bending import Bend, BendingConfig
-from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
 
 SIZE = (CAMERA.width, CAMERA.height)
@@ -69,5 +69,5 @@ def test_invalid_pixels_do_not_matter():
     ("changes", "what"), [({"grids": (1,)}, "at least 2 bumps"), ({"bump_deviation": 0.0}, "bump_deviation 0.0")]
 )
 def test_bendings_that_are_none_are_refused(changes, what):
-    with pytest.raises(InputError, match=what):
+    with refused(what):
         BendingConfig(**changes)

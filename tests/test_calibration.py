@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from raising import refused
 from scenes import C3VD, LENSES
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
@@ -52,32 +53,32 @@ def test_colmap_models_are_read(tmp_path):
 
 BAD_CAMERAS = {
     "fx is not known": {**PINHOLE_FILE, "fx": 500},
-    "width missing; expected model, width": {k: v for k, v in PINHOLE_FILE.items() if k != "width"},
+    "width missing": {k: v for k, v in PINHOLE_FILE.items() if k != "width"},
     "pixel_center": {**PINHOLE_FILE, "pixel_center": 0.25},
-    r"params\.1": {**PINHOLE_FILE, "params": [500, "wide", 320, 240]},
-    "unknown camera model 'FISHEYE'; expected one of PINHOLE, OPENCV": {**PINHOLE_FILE, "model": "FISHEYE"},
-    "PINHOLE has 4 parameters, found 3": {**PINHOLE_FILE, "params": [500, 320, 240]},
-    "PINHOLE camera: focal lengths": {**PINHOLE_FILE, "params": [-500, 500, 320, 240]},
+    "params.1": {**PINHOLE_FILE, "params": [500, "wide", 320, 240]},
+    "unknown camera model 'FISHEYE'": {**PINHOLE_FILE, "model": "FISHEYE"},
+    "3 parameters of PINHOLE": {**PINHOLE_FILE, "params": [500, 320, 240]},
+    "PINHOLE camera … focal lengths": {**PINHOLE_FILE, "params": [-500, 500, 320, 240]},
     "cx not finite": '{"model": "PINHOLE", "width": 640, "height": 480, "params": [500, 500, NaN, 240]}',
-    "size 0x480": {**PINHOLE_FILE, "width": 0},
+    "size … 0x480": {**PINHOLE_FILE, "width": 0},
     "not valid JSON": "{'model': PINHOLE",
-    "the file: Input should be": [1, 2],
+    "the file: found list": [1, 2],
 }
 
 
 @pytest.mark.parametrize("message", BAD_CAMERAS)
 def test_a_camera_file_that_cannot_be_used_is_refused_by_name(tmp_path, message):
-    with pytest.raises(InputError, match=rf"camera\.json: .*{message}"):
+    with refused(message, where="camera.json"):
         read_camera(written(tmp_path / "camera.json", BAD_CAMERAS[message]))
 
 
 def test_a_missing_file_and_one_that_is_no_text_are_refused_by_name(tmp_path):
-    with pytest.raises(InputError, match=r"none\.json: cannot be read \(No such file"):
+    with refused(where="none.json", found="cannot be read (No such file"):
         read_json(tmp_path / "none.json")
-    with pytest.raises(InputError, match="cannot be read"):
+    with refused(found="cannot be read"):
         read_json(tmp_path)
     (tmp_path / "image.json").write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(InputError, match=r"image\.json: not valid JSON"):
+    with refused(where="image.json", found="not valid JSON"):
         read_json(tmp_path / "image.json")
 
 
@@ -115,7 +116,7 @@ def test_a_file_whose_name_has_an_equals_sign_is_still_a_file(tmp_path):
     ("text", "message"),
     [
         ("gama=2.2", "gama is not known .is gamma meant"),
-        ("gamma=bright", "gamma: Input should be a valid number"),
+        ("gamma=bright", "gamma: found 'bright'; input should be a valid number"),
         ("gamma=2.2,mu", "name=number pairs"),
         ("position_mm=1,2,3", "name=number pairs"),
         ("gamma=50", "light: gamma 50.0; expected"),
@@ -130,7 +131,7 @@ def test_a_light_written_wrongly_is_refused_with_what_was_typed(text, message):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ({"sigma": 1.0}, "sigma is not known; expected gamma, mu"),
+        ({"sigma": 1.0}, "sigma is not known"),
         ({"position_mm": [0, 0]}, "position_mm"),
         ({"direction": [0, 0, 0]}, "direction is zero"),
         ({"mu": -1}, "mu -1.0"),
@@ -138,10 +139,10 @@ def test_a_light_written_wrongly_is_refused_with_what_was_typed(text, message):
     ],
 )
 def test_a_light_file_that_cannot_be_used_is_refused_by_name(tmp_path, data, message):
-    with pytest.raises(InputError, match=rf"light\.json: .*{message}"):
+    with refused(where="light.json", found=message):
         read_light(written(tmp_path / "light.json", data))
 
 
 def test_a_light_that_is_neither_file_nor_values_is_refused():
-    with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):
+    with refused(where="nowhere.json", found="cannot be read"):
         read_light("nowhere.json")

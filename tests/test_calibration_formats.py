@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from raising import refused
 from scenes import BROWN, C3VD, ENDOMAPPER, PINHOLE
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
@@ -91,7 +92,7 @@ def test_a_camera_that_a_format_cannot_hold_is_refused_with_the_way_out(tmp_path
     with pytest.raises(InputError, match=rf"camera\.{suffix}: .*convert-camera .*--model \w+"):
         write_camera(camera, tmp_path / f"camera.{suffix}")
     assert not (tmp_path / f"camera.{suffix}").exists()
-    with pytest.raises(InputError, match=r"camera\.dat: no camera format ends in '\.dat'"):
+    with refused(where="camera.dat", found="no camera format ends in '.dat'"):
         write_camera(camera, tmp_path / "camera.dat")
 
 
@@ -134,13 +135,13 @@ def test_intrinsics_hold_a_pinhole_without_its_size(tmp_path, format, side):
 
 def test_a_format_without_a_place_for_the_camera_names_the_models_it_has(tmp_path):
     for camera, format, message in (
-        (PINHOLE, "ocamcalib", "ocamcalib has no PINHOLE camera; .*--model SCARAMUZZA"),
-        (BROWN, "intrinsics", r"intrinsics\.txt has no OPENCV camera; .*--model PINHOLE"),
-        (BROWN, "vicalib", "tangential terms; it can be converted to OPENCV_FISHEYE or PINHOLE"),
+        (PINHOLE, "ocamcalib", "ocamcalib has no PINHOLE camera … --model SCARAMUZZA"),
+        (BROWN, "intrinsics", "intrinsics.txt has no OPENCV camera … --model PINHOLE"),
+        (BROWN, "vicalib", "tangential terms … it can be converted to OPENCV_FISHEYE or PINHOLE"),
         (C3VD.resized(1350, 200), "ocamcalib", "ocamcalib's is about 1: resize"),
-        (PINHOLE, "kalibr", "format 'kalibr' is not known; expected one of json, vicalib"),
+        (PINHOLE, "kalibr", "format 'kalibr' is not known"),
     ):
-        with pytest.raises(InputError, match=message):
+        with refused(message):
             write_camera(camera, tmp_path / "camera.txt", format)
         assert not list(tmp_path.iterdir())
 
@@ -232,7 +233,7 @@ def test_intrinsics_are_a_pinhole_of_the_given_size(tmp_path):
     assert read_camera(written(tmp_path / "intrinsics.txt", HAMLYN), (320, 240)) == expected
     three = "383.1, 0, 155.9\n0, 383.2, 124.3\n0, 0, 1\n"
     assert read_camera(written(tmp_path / "intrinsics.txt", three), (320, 240)) == expected
-    with pytest.raises(InputError, match=r"intrinsics\.txt: holds no image size; give it .*size=.*pixel_center"):
+    with refused(where="intrinsics.txt", found="holds no image size", cure="pixel_center"):
         read_camera(tmp_path / "intrinsics.txt")
 
 
@@ -240,7 +241,7 @@ def test_a_colmap_file_has_to_hold_one_camera(tmp_path):
     one = "# CAMERA_ID MODEL\n7 SIMPLE_PINHOLE 640 480 500 320.0 240.0\n"
     assert read_camera(written(tmp_path / "cameras.txt", one)) == Pinhole(640, 480, 500, 500, 320, 240)
     two = one + "9 PINHOLE 640 480 500 500 320 240\n"
-    with pytest.raises(InputError, match=r"cameras\.txt: 2 cameras, with ids 7, 9; expected exactly one"):
+    with refused(where="cameras.txt", found="2 cameras, with ids 7, 9"):
         read_camera(written(tmp_path / "cameras.txt", two))
 
 
@@ -248,8 +249,8 @@ BOMB = '<?xml version="1.0"?><!DOCTYPE rig [<!ENTITY a "1"><!ENTITY b "&a;&a;">]
 BAD = {
     "entities": ("g.xml", BOMB, "DTD or entities"),
     "broken": ("g.xml", GEOMETRY[:-8], "not valid XML"),
-    "no params": ("g.xml", GEOMETRY.replace("params", "parms"), "params missing; expected 8 numbers"),
-    "no width": ("g.xml", GEOMETRY.replace("width", "w"), "width missing"),
+    "no params": ("g.xml", GEOMETRY.replace("params", "parms"), "params: missing; expected 8 numbers"),
+    "no width": ("g.xml", GEOMETRY.replace("width", "w"), "width: missing"),
     "half a pixel": ("g.xml", GEOMETRY.replace(" 1440 ", " 1440.5 "), r"width 1440\.5; expected whole pixels"),
     "type": ("g.xml", GEOMETRY.replace("kb4", "w"), "type 'calibu_fu_fv_u0_v0_w' is not known; expected one of .*kb4"),
     "EndoMapper's own type": (
@@ -296,7 +297,7 @@ BAD = {
     "intrinsics transposed": ("i.txt", "500 0 0\n0 500 0\n320 240 1", "not a camera matrix; it looks transposed"),
     "intrinsics skew": ("i.txt", "500 1 320\n0 500 240\n0 0 1", "skew 1 in the first row"),
     "intrinsics word": ("i.txt", "500 0 cx\n0 500 240\n0 0 1", "found 'cx', which is not a number"),
-    "colmap params": ("cameras.txt", "1 PINHOLE 640 480 500 320 240\n", "line 1: PINHOLE has 4 parameters, found 3"),
+    "colmap params": ("cameras.txt", "1 PINHOLE 640 480 500 320 240\n", "line 1: 3 parameters of PINHOLE; expected 4"),
     "colmap model": ("cameras.txt", "1 FOV 640 480 500 500 320 240 0.9\n", "unknown camera model 'FOV'"),
     "colmap nan": ("cameras.txt", "1 PINHOLE 640 480 500 nan 320 240\n", "fy not finite"),
     "prose": (
@@ -317,11 +318,11 @@ def test_a_calibration_that_cannot_be_used_is_refused_by_file_and_field(tmp_path
 
 def test_an_image_or_a_folder_is_no_calibration(tmp_path):
     (tmp_path / "frame.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\xff")
-    with pytest.raises(InputError, match=r"frame\.png: not a text file; expected camera\.json"):
+    with refused(where="frame.png", found="not a text file", cure="expected camera.json"):
         read_camera(tmp_path / "frame.png")
-    with pytest.raises(InputError, match="cannot be read"):
+    with refused(found="cannot be read"):
         read_camera(tmp_path)
-    with pytest.raises(InputError, match="cannot be read"):
+    with refused(found="cannot be read"):
         read_light(tmp_path)
 
 
@@ -353,11 +354,11 @@ def test_what_the_model_of_the_light_lacks_is_said(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("<mu> 2.767302 </mu>", "", "mu missing; expected 1 number"),
-        ("<P> [ -6.1e-05; -0.001135", "<P> [ -0.001135", "P: 2 numbers; expected 3"),
-        ("-0.003612", "-3.612", r"P is 3\.612 from the lens; expected metres"),
+        ("<mu> 2.767302 </mu>", "", "mu … missing … expected 1 number"),
+        ("<P> [ -6.1e-05; -0.001135", "<P> [ -0.001135", "2 numbers … expected 3"),
+        ("-0.003612", "-3.612", "P is 3.612 from the lens"),
         ("0.011092; 0.0; 0.999938", "0; 0; 0", "direction is zero"),
-        ("[ 2.2 ]", "[ inf ]", "gamma: inf is not finite"),
+        ("[ 2.2 ]", "[ inf ]", "gamma … inf is not finite"),
         ("[ 2.2 ]", "[ 22 ]", "gamma 22"),
         ('"sls"', '"area"', "light_model type 'area' is not known"),
         ("<rig>", "<!DOCTYPE rig><rig>", "DTD or entities"),
@@ -365,12 +366,12 @@ def test_what_the_model_of_the_light_lacks_is_said(tmp_path):
 )
 def test_a_photometric_xml_that_cannot_be_used_is_refused_by_file_and_field(tmp_path, old, new, message):
     assert old in PHOTOMETRY
-    with pytest.raises(InputError, match=rf"p\.xml: .*{message}"):
+    with refused(message, where="p.xml"):
         read_light(written(tmp_path / "p.xml", PHOTOMETRY.replace(old, new)))
 
 
 def test_the_two_xml_files_of_an_endoscope_are_not_mistaken_for_each_other(tmp_path):
-    with pytest.raises(InputError, match=r"a geometric calibration; .*--camera"):
+    with refused(found="a geometric calibration", cure="--camera"):
         read_light(written(tmp_path / "g.xml", GEOMETRY))
 
 
@@ -380,5 +381,5 @@ def test_endomapper_s_layout_is_read_from_the_sample_files(realdata):
     assert camera == ENDOMAPPER.with_pixel_center(0.0)
     light = read_light(folder / "Endoscope_sample_photometrical.xml")
     assert np.linalg.norm(light.position_mm) == pytest.approx(3.787, abs=1e-3)
-    with pytest.raises(InputError, match=r"pattern\.xml: no elements camera_model"):
+    with refused(where="pattern.xml", found="no elements camera_model"):
         read_camera(folder / "pattern.xml")

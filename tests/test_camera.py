@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from raising import refused
 from scenes import BROWN, C3VD, ENDOMAPPER, LENSES, PINHOLE
 
 from lightdepth import native
@@ -21,7 +22,6 @@ from lightdepth.camera import (
     camera_from_params,
 )
 from lightdepth.datasets.c3vd import C3VD_V2
-from lightdepth.errors import InputError
 
 # Strong enough for tangential terms to fold the image before radial ones would
 STRONG = Brown(640, 480, 400.0, 408.0, 328.0, 236.8, -0.5, 0.12, 0.02, -0.015)
@@ -365,18 +365,18 @@ def test_cameras_survive_their_file_form(lens):
 
 
 BAD = {
-    "size 0x480": lambda: Pinhole(0, 480, 1.0, 1.0, 0.0, 0.0),
+    "size … 0x480": lambda: Pinhole(0, 480, 1.0, 1.0, 0.0, 0.0),
     "fy not finite": lambda: Pinhole(640, 480, 1.0, np.nan, 0.0, 0.0),
     "focal lengths -5": lambda: KannalaBrandt(640, 480, -5.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     "a0 = -769": lambda: Scaramuzza(640, 480, 0.0, 0.0, -769.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
     "singular": lambda: Scaramuzza(640, 480, 0.0, 0.0, 769.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    "my.json: unknown camera model 'FOV'": lambda: camera_from_params("FOV", 640, 480, [1.0], "my.json"),
-    "my.json: PINHOLE has 4 parameters, found 3": lambda: camera_from_params("PINHOLE", 9, 9, [1.0] * 3, "my.json"),
-    "my.json: PINHOLE camera: focal": lambda: camera_from_params("PINHOLE", 9, 9, [-1.0] * 4, "my.json"),
+    "my.json … unknown camera model 'FOV'": lambda: camera_from_params("FOV", 640, 480, [1.0], "my.json"),
+    "my.json … 3 parameters of PINHOLE": lambda: camera_from_params("PINHOLE", 9, 9, [1.0] * 3, "my.json"),
+    "my.json: PINHOLE camera … focal": lambda: camera_from_params("PINHOLE", 9, 9, [-1.0] * 4, "my.json"),
 }
 
 
 @pytest.mark.parametrize("message", BAD)
 def test_a_camera_that_cannot_be_is_refused_by_name(message):
-    with pytest.raises(InputError, match=message):
+    with refused(message):
         BAD[message]()

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from colons import SMALL
+from raising import refused
 
 import lightdepth.tube.scene as scene
 from lightdepth import native
-from lightdepth.errors import InputError
 from lightdepth.tube import Tube, camera_path, lens, octagon, realistic, render_sequence
 from lightdepth.tube.casting import EmbreeCaster, WarpCaster, rendering_device
 from lightdepth.tube.variant import variant_frames
@@ -129,15 +129,15 @@ def test_the_distance_to_the_wall_needs_no_gpu(shape):
 def test_a_device_that_is_not_there_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert rendering_device("auto") == CPU == rendering_device("cpu")
-    with pytest.raises(InputError, match="PyTorch finds no GPU"):
+    with refused(found="PyTorch finds no GPU"):
         rendering_device("cuda")
-    with pytest.raises(InputError, match="device 'gpu' to render on; expected auto, cpu or cuda"):
+    with refused(where="to render on", found="'gpu'"):
         rendering_device("gpu")
 
 
 def test_without_the_library_the_message_says_what_to_install(monkeypatch):
     native.warp.cache_clear()
     monkeypatch.setitem(sys.modules, "warp", None)
-    with pytest.raises(InputError, match=r"lightdepth\[gpu\]"):
+    with refused(cure="lightdepth[gpu]"):
         WarpCaster(np.zeros((3, 3)), np.array([[0, 1, 2]]), CPU)
     native.warp.cache_clear()

@@ -271,7 +271,7 @@ BAD_INPUT = {
     "no such checkpoint": (["predict", "DATA", "--checkpoint", "best"], "best: no such checkpoint"),
     "no such map": (["densify", "DATA", "--map", "NOWHERE", "--checkpoint", "decline"], "nowhere: no such file"),
     "no map in it": (["densify", "DATA", "--map", "DATA", "--checkpoint", "decline"], "no map in it"),
-    "share": (["densify", "DATA", "--map", "SLAM", "--withhold", "1.5", "--checkpoint", "decline"], "withhold 1.5"),
+    "share": (["densify", "DATA", "--map", "SLAM", "--withhold", "1.5", "--checkpoint", "decline"], "withhold: 1.5"),
     "format": (["densify", "DATA", "--map", "SLAM", "--formats", "[obj]", "--checkpoint", "decline"], "expected ply"),
     "scale": (
         ["densify", "DATA", "--map", "SLAM", "--mm_per_unit", "-1", "--checkpoint", "decline"],
@@ -282,9 +282,9 @@ BAD_INPUT = {
         "gama is not known (is gamma meant?)",
     ),
     "mask": (["predict", "DATA", "--mask", "NOWHERE", "--checkpoint", "decline"], "nowhere: no such mask"),
-    "frames": (["synth", "--frames", "0"], "--frames 0; expected at least 1"),
+    "frames": (["synth", "--frames", "0"], "--frames: 0; expected at least 1"),
     "too few frames": (["synth", "--frames", "2", "--size", "[24, 20]"], "render more frames"),
-    "spurious": (["synth", "--spurious", "1.5"], "--spurious 1.5"),
+    "spurious": (["synth", "--spurious", "1.5"], "--spurious: 1.5"),
     "no run": (["evaluate", "NOWHERE", "--truth", "DATA"], "nowhere: no such folder"),
     "no maps": (["evaluate", "DATA", "--truth", "DATA"], r"neither map_* folders"),
 }

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from colons import colon, sequence, slam, truth
+from raising import refused
 
 from densify.alignment import Alignment
 from densify.config import DensifyConfig
@@ -17,7 +18,6 @@ from densify.dense_map import GREEN, GREY, RED, DenseMap, Surface, read_dense_ma
 from densify.pipeline import densify
 from lightdepth import native
 from lightdepth.calibration import read_camera
-from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
 
 
@@ -181,7 +181,7 @@ def test_an_empty_surface_is_written_and_read(dense, tmp_path):
 def test_a_missing_file_is_named(dense, tmp_path, name):
     dense.write(tmp_path / "map_000")
     (tmp_path / "map_000" / name).unlink()
-    with pytest.raises(InputError, match=f"map_000: {name} missing; expected a map folder"):
+    with refused(where="map_000", found=f"{name} missing"):
         read_dense_map(tmp_path / "map_000")
 
 
@@ -190,13 +190,13 @@ def test_a_damaged_file_is_named(dense, tmp_path, name):
     dense.write(tmp_path / "map_000")
     file = tmp_path / "map_000" / name
     file.write_bytes(file.read_bytes()[:500])
-    with pytest.raises(InputError, match=f"{name}: damaged"):
+    with refused(where=name, found="damaged"):
         read_dense_map(tmp_path / "map_000")
 
 
 def test_a_folder_without_a_map_s_number_is_refused(dense, tmp_path):
     dense.write(tmp_path / "map_old")
-    with pytest.raises(InputError, match="map_old: expected a name such as map_000"):
+    with refused(where="map_old", cure="expected a name such as map_000"):
         read_dense_map(tmp_path / "map_old")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from raising import refused
 from verbs import by_options
 from videos import CAMERA, OCTAGON, picture, uneven_times, write_video
 
@@ -17,7 +18,6 @@ from lightdepth.command_line.parsing import spelled
 from lightdepth.commands.import_frames import import_frames as import_frames_verb
 from lightdepth.datasets import FrameSequence, VideoFile, open_sequence, write_folder
 from lightdepth.datasets.sequence import border_mask
-from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.image_quality import Measures, Meter, one_field
 from lightdepth.importing.overlay import find_overlay
@@ -107,7 +107,7 @@ def test_without_a_camera_it_is_imported_and_the_report_says_so(tmp_path):
         cv2.imwrite(str(tmp_path / "in" / f"Mueller_{i}.png"), picture(i)[..., ::-1])
     import_frames(tmp_path / "in", tmp_path / "out")
     assert not (tmp_path / "out" / "camera.json").exists() and "No calibration" in findings(tmp_path / "out")
-    with pytest.raises(InputError, match=r"no camera\.json; give --camera"):
+    with refused(found="no camera.json", cure="give --camera"):
         open_sequence(tmp_path / "out")
     assert b"Mueller" not in b"".join(f.read_bytes() for f in (tmp_path / "out").rglob("*") if f.is_file())
 
@@ -274,7 +274,7 @@ def test_frames_are_chosen_by_time_and_what_is_blurred_frozen_or_unreadable_is_n
     assert (selected(times, found, Choice(blur=0)) == KEPT).sum() == 7
     assert np.flatnonzero(selected(times, found, Choice(every=2, blur=0)) == KEPT).tolist() == [0, 2, 4]
     assert (selected(times, found, Choice(max_frames=3)) == KEPT).sum() == 3
-    with pytest.raises(InputError, match="the frames have no times; choose with --every"):
+    with refused(found="the frames have no times", cure="choose with --every"):
         selected(np.full(9, np.nan), found, Choice(rate=2))
 
 
@@ -291,7 +291,7 @@ def test_frames_are_chosen_by_time_and_what_is_blurred_frozen_or_unreadable_is_n
     ],
 )
 def test_wrong_options_are_refused_and_leave_nothing(sources, tmp_path, options, message):
-    with pytest.raises(InputError, match=message):
+    with refused(message):
         import_frames(sources["ffv1"], tmp_path / "out", **options)
     assert not list(tmp_path.iterdir())
 

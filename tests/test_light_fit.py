@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from colons import colon, sequence, slam
+from raising import refused
 from scenes import C3VD, cylinder, ray_tensors, slanted_plane
 
 from lightdepth.calibration import read_light
 from lightdepth.cli import main
 from lightdepth.datasets import FrameSequence, open_sequence, write_folder
-from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.light.fit_on_map import LightSamples, fit_on_map, fit_samples, map_views, samples_of, withheld_error
 from lightdepth.light.fit_on_truth import fit_on_truth
@@ -111,7 +111,7 @@ def test_a_fit_that_is_not_better_keeps_the_defaults_and_says_so():
 
 def test_a_map_of_too_few_keyframes_is_refused_with_the_count():
     frames, found = facing_map(PhotometricCalibration(), count=3)
-    with pytest.raises(InputError, match=r"3 keyframes with at least 20 observed points.* expected at least 4"):
+    with refused(found="3 keyframes with at least 20 observed points", cure="expected at least 4"):
         fit_on_map(frames, found)
 
 
@@ -141,7 +141,7 @@ def test_known_depth_gives_the_endoscope_s_own_light_through_lambert_s_cosine(ga
 
 def test_frames_without_depth_are_told_to_bring_a_map():
     frames = [replace(f, true_distance=None) for f in colon(0).frames]
-    with pytest.raises(InputError, match=r"0 frames with known distance.*--map MAP"):
+    with refused(found="0 frames with known distance", cure="--map MAP"):
         fit_on_truth(sequence(frames))
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 from colons import EXACT, colon, slam
+from raising import refused
 
 from lightdepth.datasets import FrameSequence
-from lightdepth.errors import InputError
 from lightdepth.sparse_map import SparseMap
 from train.adapting.map_teacher import MapTeacher, map_terms
 
@@ -111,5 +111,5 @@ def test_keyframes_of_two_submaps_never_meet(frames, found_map):
 
 
 def test_a_map_that_has_nothing_left_to_teach_is_named(frames, found_map):
-    with pytest.raises(InputError, match=r"no keyframe to learn from has 8 points"):
+    with refused(found="no keyframe to learn from has 8 points"):
         teacher(frames, found_map, frames.numbers)

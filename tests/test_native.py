@@ -5,10 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import pytest
+from raising import refused
 
 from lightdepth import native
-from lightdepth.errors import InputError
 
 
 def test_cv2_is_imported_before_pycolmap():
@@ -39,5 +38,5 @@ def test_missing_system_libraries_are_named_by_their_package(monkeypatch):
 
 def test_an_open3d_that_cannot_be_loaded_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(InputError, match=r"apt-get install libusb-1\.0-0 libgl1"):
+    with refused(cure="apt-get install libusb-1.0-0 libgl1"):
         native.open3d.__wrapped__()

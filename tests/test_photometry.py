@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from raising import refused
 from scenes import C3VD, ENDOMAPPER, LENSES, cylinder, ray_tensors, slanted_plane, sphere
 
 from lightdepth.camera import Pinhole
-from lightdepth.errors import InputError
 from lightdepth.photometry import (
     PhotometricCalibration,
     bent,
@@ -236,8 +236,8 @@ def test_a_co_located_light_sits_at_the_camera_and_looks_along_the_axis():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"gamma": 0.0}, "gamma 0.0; expected"),
-        ({"gamma": 22.0}, "gamma 22.0; expected"),
+        ({"gamma": 0.0}, "gamma 0.0"),
+        ({"gamma": 22.0}, "gamma 22.0"),
         ({"mu": -1.0}, "mu -1.0"),
         ({"gain": 0.0}, "gain 0.0"),
         ({"reflectance": 1.0}, "reflectance 1.0"),
@@ -251,5 +251,5 @@ def test_a_co_located_light_sits_at_the_camera_and_looks_along_the_axis():
     ids=lambda x: str(x) if isinstance(x, dict) else "",
 )
 def test_a_light_that_cannot_be_is_refused(wrong, message):
-    with pytest.raises(InputError, match=message):
+    with refused(message):
         PhotometricCalibration(**wrong)

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from raising import refused
 from scenes import LENSES, slanted_plane
 
-from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction, read_prediction
 
 
@@ -96,7 +96,7 @@ CORRUPT = {
 def test_a_file_that_is_no_prediction_is_refused_by_name(tmp_path, how):
     path = tmp_path / "bad.npz"
     CORRUPT[how](path)
-    with pytest.raises(InputError, match=r"bad\.npz: not a prediction made by `lightdepth predict`"):
+    with refused(where="bad.npz", found="not a prediction", cure="`lightdepth predict`"):
         read_prediction(path)
 
 
@@ -107,5 +107,5 @@ def test_bytes_gone_bad_inside_the_file_are_refused(tmp_path):
     for start in range(200, len(content) - 400, 150):
         content[start : start + 8] = b"\xff" * 8
     path.write_bytes(content)
-    with pytest.raises(InputError, match="not a prediction"):
+    with refused(found="not a prediction"):
         read_prediction(path)

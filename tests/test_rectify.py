@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from raising import refused
 from scenes import Scene, cylinder, slanted_plane, sphere
 
 from densify.fusion.rectify import FULL, DirectionTable, RectifyConfig, SurfaceView, light_weight, surface_view
@@ -154,9 +155,8 @@ def test_a_pinhole_field_crops_a_fisheye_and_leaves_a_pinhole_whole():
 
 
 def test_a_field_that_is_none_is_refused():
-    from lightdepth.errors import InputError
 
-    with pytest.raises(InputError, match="field 'half'; expected whole or pinhole"):
+    with refused(where="field", found="'half'"):
         RectifyConfig(field="half")
 
 

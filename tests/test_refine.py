@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from colons import colon
+from raising import refused
 from scenes import cylinder
 
 from lightdepth.camera import Pinhole
-from lightdepth.errors import InputError
 from lightdepth.frame import to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.models import ConstantModel, DeclineModel
@@ -77,5 +77,5 @@ def test_a_refined_model_gives_whole_predictions_at_the_frame_s_size(frame):
 
 def test_settings_that_mean_nothing_are_refused():
     for wrong in ({"steps": -1}, {"rows": 4}, {"levels": 0}, {"anchor": -1.0}, {"learning_rate": 0.0}):
-        with pytest.raises(InputError, match="expected at least"):
+        with refused(cure="expected at least"):
             RefineConfig(**wrong)

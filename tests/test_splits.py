@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 from colons import colon
+from raising import refused
 
 from lightdepth.datasets import FORMATS, write_c3vd
 from lightdepth.datasets.c3vd import C3VD, C3VD_V2
 from lightdepth.datasets.catalogue import read_dataset_yaml
 from lightdepth.datasets.splits import check_apart, folders, read_split, same_sequence
-from lightdepth.errors import InputError
 from lightdepth.tube import lens
 from train.datamodule import FrameData, FrameDataModule
 
@@ -133,7 +133,7 @@ def test_ppsnet_s_lists_cut_desc_t4_a_in_two_and_say_that_it_leaks():
 REFUSED = {
     "the same sequence in two parts": (
         parts(train="a, b", test="c, b"),
-        r"b of test is in train too; a sequence belongs",
+        "b of test is in train too",
     ),
     "the same twice in a part": (parts(train="a, b, a"), "train has a twice"),
     "in upper case": (
@@ -150,34 +150,34 @@ REFUSED = {
     ),
     "C3VDv2's screening": (parts(train="c0_full_t3_v1", test="screening_t3"), "is in train too"),
     "with a dot": (parts(train="a/./b", test="a/b"), "is in train too"),
-    "above the root": (parts(train="../other/a"), r"train: '\.\./other/a' leads outside the data's root"),
+    "above the root": (parts(train="../other/a"), "train: '../other/a' … leads outside the data's root"),
     "through a folder": (parts(train="a/../../b"), "leads outside the data's root"),
     "absolute": (parts(train="/etc"), "leads outside the data's root"),
     "another drive": (parts(train='"C:\\\\data"'), "leads outside the data's root"),
-    "an empty part": (parts(train="a", val=""), "val is empty; name its sequences, or leave it out"),
-    "no part": ("parts: {}\n", "no parts in it; expected train, val, test"),
+    "an empty part": (parts(train="a", val=""), "val is empty"),
+    "no part": ("parts: {}\n", "no parts in it"),
     "a part of another name": (
         parts(train="a", validation="b"),
-        r"parts\.validation is not known; expected train, val, test",
+        "parts.validation is not known",
     ),
-    "a key of another name": ("sets: {}\n" + parts(train="a"), "sets is not known; expected dataset, unit"),
-    "no list": ("parts: {train: a}\n", r"parts\.train: Input should be a valid list"),
+    "a key of another name": ("sets: {}\n" + parts(train="a"), "sets is not known"),
+    "no list": ("parts: {train: a}\n", "parts.train: found 'a' … a valid list"),
     "a key twice": ("parts:\n  train: [a]\n  train: [b]\n", "the key train is there twice"),
     "broken YAML": ("parts: [\n", "not valid YAML"),
     "an object of Python": ("parts: !!python/object/apply:os.system [true]\n", "not valid YAML"),
-    "a list": ("- a\n", "no keys in it; expected dataset, unit"),
+    "a list": ("- a\n", "no keys in it"),
     "ranges without a reason": (
         parts(train='"a[0:5]"', test='"a[5:9]"'),
-        r"a\[5:9\] of test is in train too.*under leaks",
+        "a[5:9] of test is in train too",
     ),
-    "an empty range": (parts(train='"a[5:5]"'), r"no frames in \[5:5\]"),
+    "an empty range": (parts(train='"a[5:5]"'), "no frames in [5:5]"),
     "ranges that meet": (
         parts(train='"a[0:5]"', test='"a[4:9]"') + "leaks: {a: why}\n",
-        r"\(a\[0:5\]\), with frames in both",
+        "(a[0:5]), with frames in both",
     ),
     "the whole and a range": (parts(train='"a[0:5]"', test="a") + "leaks: {a: why}\n", "with frames in both"),
     "a leak that is none": (parts(train="a") + "leaks: {a: why}\n", "leaks: a is not in two parts"),
-    "an excluded one": (parts(train="dataset_4/keyframe_1") + "excluded: {dataset_4: bad}\n", r"but excluded \(bad\)"),
+    "an excluded one": (parts(train="dataset_4/keyframe_1") + "excluded: {dataset_4: bad}\n", "but excluded (bad)"),
     "a patient in two parts": (
         "unit: patient\npatients: {p: [a*, c]}\n" + parts(train="a1", test="c"),
         "c of test and a1 of train are of the same patient, p",
@@ -195,9 +195,9 @@ REFUSED = {
 def test_a_split_that_would_deceive_is_refused_with_file_and_reason(split, what):
     text, message = REFUSED[what]
     path = split(text)
-    with pytest.raises(InputError, match=message) as refused:
+    with refused(message) as raised:
         read_split(path)
-    assert str(path) in str(refused.value)
+    assert str(path) in str(raised.value)
 
 
 def test_a_sequence_that_the_data_set_does_not_have_is_refused_with_the_one_that_is_meant(tmp_path):
@@ -205,7 +205,7 @@ def test_a_sequence_that_the_data_set_does_not_have_is_refused_with_the_one_that
     path.parent.mkdir(parents=True)
     (tmp_path / "c3vd" / "dataset.yaml").write_text((DATA / "c3vd" / "dataset.yaml").read_text())
     path.write_text("dataset: c3vd\n" + parts(train="trans_t1_a, cecum_t5_a"))
-    with pytest.raises(InputError, match=r"C3VD has no sequence cecum_t5_a; is cecum_t._a meant"):
+    with refused(found="C3VD has no sequence cecum_t5_a", cure="is cecum_t"):
         read_split(path)
 
 
@@ -224,26 +224,26 @@ def test_sequences_are_found_under_their_other_names(split, tree):
     names = {part: [folder.name for folder, _ in of] for part, of in found.items()}
     assert names == {"train": ["trans_t1_a_under_review", "c0_cecum_t1_v2"], "test": ["desc_t4_a"]}
     tree("TRANS_T1_A")
-    with pytest.raises(InputError, match="TRANS_T1_A and trans_t1_a_under_review are both trans_t1_a; keep one"):
+    with refused(found="TRANS_T1_A and trans_t1_a_under_review are both trans_t1_a"):
         folders(read_split(split(parts(train="trans_t1_a"))), root, ("train",))
 
 
 def test_all_missing_sequences_are_listed_but_only_of_the_parts_that_are_asked_for(split, tree):
     root = tree("a")
     of = read_split(split(parts(train="a, b, c/d", test="e")))
-    with pytest.raises(InputError, match=r"2 of the sequences of .* are not there: b, c/d; download"):
+    with refused(found="are not there: b, c/d", cure="download"):
         folders(of, root, ("train",))
     assert [f.name for f, _ in folders(read_split(split(parts(train="a", test="e"))), root, ("train",))["train"]] == [
         "a"
     ]
-    with pytest.raises(InputError, match="no such folder"):
+    with refused(found="no such folder"):
         folders(of, root / "nowhere", ("train",))
 
 
 def test_one_folder_by_a_link_is_one_sequence(split, tree):
     root = tree("a")
     (root / "b").symlink_to(root / "a", target_is_directory=True)
-    with pytest.raises(InputError, match=r"b of test is the same folder as a of train"):
+    with refused(found="b of test is the same folder as a of train"):
         folders(read_split(split(parts(train="a", test="b"))), root, ("train",))
 
 
@@ -266,13 +266,13 @@ def test_training_takes_train_and_val_of_a_split_and_never_opens_its_test(split,
 
 def test_a_split_needs_its_root_a_training_part_and_no_sequences_beside_it(split, tree):
     root, path = str(tree("a")), str(split(parts(test="a")))
-    with pytest.raises(InputError, match="no train in it"):
+    with refused(found="no train in it"):
         FrameDataModule(FrameData(split=path, root=root)).setup()
-    with pytest.raises(InputError, match=r"go together: --data\.split FILE --data\.root DIR"):
+    with refused(cure="--data.split FILE --data.root DIR"):
         FrameDataModule(FrameData(split=path))
-    with pytest.raises(InputError, match="not both"):
+    with refused(cure="not both"):
         FrameDataModule(FrameData([root], split=path, root=root))
-    with pytest.raises(InputError, match=r"no frame in a\[7:9\]; its numbers are 0 to 3"):
+    with refused(found="no frame in a[7:9]", cure="its numbers are 0 to 3"):
         FrameDataModule(FrameData(split=str(split(parts(train='"a[7:9]"'))), root=root)).setup()
 
 
@@ -301,7 +301,7 @@ def test_folders_given_by_hand_to_train_and_validate_on_are_kept_apart(tree, tmp
     link = tmp_path / "link"
     link.symlink_to(root / "a", target_is_directory=True)
     for val in (root / "a", root / "b" / ".." / "a", link, root, root / "a" / "frames"):
-        with pytest.raises(InputError, match="validated on, but also trained on"):
+        with refused(found="validated on, but also trained on"):
             FrameDataModule(FrameData([str(root / "a")], [str(val)]))
     check_apart([root / "a"], [root / "b"])
 
@@ -312,13 +312,13 @@ def test_folders_given_by_hand_to_train_and_validate_on_are_kept_apart(tree, tmp
 BROKEN_INFO = {
     "a camera of another model": (
         "cameras: {c: {model: X, width: 1, height: 1, params: []}}",
-        "cameras.c: unknown camera model",
+        "cameras.c … unknown camera model",
     ),
-    "a format without a reader": ("format: bag", "format: no reader for 'bag'; expected one of folder"),
-    "frames below one": ("sequences: {a: 0}", r"sequences\.a: Input should be greater than 0"),
+    "a format without a reader": ("format: bag", "format: no reader for 'bag'"),
+    "frames below one": ("sequences: {a: 0}", "sequences.a: found 0 … greater than 0"),
     "a sequence outside": ("sequences: {../a: 3}", "leads outside the data's root"),
-    "a unit of its own": ("unit: inch", "unit: Input should be 'mm' or 'none'"),
-    "no licence": ("licence: ''", "licence: String should have at least 1 character"),
+    "a unit of its own": ("unit: inch", "unit: found 'inch' … 'mm' or 'none'"),
+    "no licence": ("licence: ''", "licence: found '' … at least 1 character"),
 }
 
 
@@ -330,6 +330,6 @@ def test_a_dataset_yaml_that_says_what_cannot_be_is_refused(tmp_path, what):
     text = "".join(f"{k}: {v}\n" for k, v in {**lines, key: value}.items())
     path = tmp_path / "dataset.yaml"
     path.write_text(text)
-    with pytest.raises(InputError, match=message) as refused:
+    with refused(message) as raised:
         read_dataset_yaml(path)
-    assert str(path) in str(refused.value)
+    assert str(path) in str(raised.value)

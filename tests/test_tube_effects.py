@@ -11,9 +11,9 @@ import pytest
 import torch
 from colons import CAMERA, SMALL
 from jsonargparse import ArgumentError, ArgumentParser
+from raising import refused
 
 from lightdepth.datasets import read_c3vd
-from lightdepth.errors import InputError
 from lightdepth.tube import (
     FilmConfig,
     PathConfig,
@@ -292,5 +292,5 @@ def test_strong_light_between_the_walls_is_stronger_and_another_strength_is_refu
     assert np.array_equal(weak.true_distance, strong.true_distance)
     spread = [np.subtract(*np.quantile(np.log(f.image.max(-1)[f.valid] + 0.01), (0.9, 0.1))) for f in (weak, strong)]
     assert spread[1] < spread[0]  # it fills in what the lamps leave dark
-    with pytest.raises(InputError, match="strength 'some'; expected weak or strong"):
+    with refused(where="strength", found="'some'"):
         variant_frames(5, 1, CAMERA, "some")

@@ -154,11 +154,12 @@ class Diagnosis(pl.Callback):
         if self._in_a_row("blind", not (usable & ~white).any()) >= self.config.blind:
             inside = batch.mask.sum().clamp(min=1)
             raise InputError(
-                f"training: no usable pixel in {self.config.blind} batches in a row, the last {where}: "
+                "training",
+                f"no usable pixel in {self.config.blind} batches in a row, the last {where}: "
                 f"{float(white.sum() / inside):.0%} of the pixels are saturated, "
-                f"{float((batch.mask & ~usable).sum() / inside):.0%} black, "
-                f"{float(1 - batch.mask.float().mean()):.0%} outside the mask; "
-                "expected images that show the decline of light: check exposure, mask and image folder"
+                f"{float((batch.mask & ~usable).sum() / inside):.0%} black, {float(1 - batch.mask.float().mean()):.0%} "
+                "outside the mask",
+                "expected images that show the decline of light: check exposure, mask and image folder",
             )
         closed = log_closed_form(batch.image, batch.mask, batch.rays, batch.light)
         spread, expected = masked_std(outputs["distance"].log(), usable), masked_std(closed, usable)

@@ -83,18 +83,22 @@ class FrameData:
         if self.random_reflectance is not None:
             low, high = self.random_reflectance
             if not 0 <= low <= high < 1:
-                raise InputError(f"data: random_reflectance {self.random_reflectance}; expected 0 <= low <= high < 1")
+                raise InputError(
+                    "data", f"random_reflectance {self.random_reflectance}", "expected 0 <= low <= high < 1"
+                )
         if not 0 < self.held_out < 1:
-            raise InputError(f"data: held_out {self.held_out}; expected a share above 0 and below 1")
+            raise InputError("data", f"held_out {self.held_out}", "expected a share above 0 and below 1")
         if self.halves and self.batch_size < 2:
-            raise InputError("data: halves of a batch of one; expected a batch_size of at least 2")
+            raise InputError("data", "halves of a batch of one", "expected a batch_size of at least 2")
         if min(*self.size, self.batch_size) < 1:
-            raise InputError(f"data: size {self.size}, batch_size {self.batch_size}; expected positive numbers")
+            raise InputError("data", f"size {self.size}, batch_size {self.batch_size}", "expected positive numbers")
         if self.split is not None and (self.sequences or self.val_sequences):
-            raise InputError("data: a split and sequences; give --data.split FILE or --data.sequences, not both")
+            raise InputError("data", "a split and sequences", "give --data.split FILE or --data.sequences, not both")
         if (self.split is None) != (self.root is None):
             raise InputError(
-                "data: a split and the root of its sequences go together: --data.split FILE --data.root DIR"
+                "data",
+                "a split without the root of its sequences, or the other way round",
+                "give both: --data.split FILE --data.root DIR",
             )
 
     def source(self, path: str, format: str | None = None) -> SequenceSource:
@@ -126,17 +130,21 @@ class FrameDataModule(pl.LightningDataModule):
         rows = [list(range(len(frames))) for _, frames in opened]
         if self.config.frames is not None:
             if len(dict(opened)) < len(opened):
-                raise InputError(f"{self.split}: has one sequence twice in train; --data.frames cannot tell them apart")
+                raise InputError(
+                    f"{self.split}",
+                    "has one sequence twice in train",
+                    "leave one, or leave out --data.frames, which cannot tell them apart",
+                )
             rows = list(listed_rows(Path(self.config.frames), dict(opened)).values())
         for (path, frames), listed in zip(opened, rows, strict=True):
             if not listed:
                 raise InputError(
-                    f"{path}: none of its frames is listed in {self.config.frames}; leave it out, or list some"
+                    path, f"none of its frames is listed in {self.config.frames}", "leave it out, or list some"
                 )
             chosen = frames.at(listed)
             held_out = 0 if to_validate else held_out_count(len(chosen), self.config.held_out)
             if len(chosen) <= held_out:
-                raise InputError(f"{path}: {len(chosen)} frame; expected at least two, one of them to validate on")
+                raise InputError(path, f"{len(chosen)} frame", "expected at least two, one of them to validate on")
             train.append(_Frames(chosen[: len(chosen) - held_out], self.size, path))
             if held_out:
                 val.append(_Frames(chosen[-held_out:], self.size, path))
@@ -148,9 +156,11 @@ class FrameDataModule(pl.LightningDataModule):
                 train += self._colons(to_train_on, bar)
                 val += self._colons(to_validate_on, bar)
         if not train:
-            raise InputError("nothing to train on; give --data.sequences FOLDER, or --data.tube.scenes N")
+            raise InputError("data", "nothing to train on", "give --data.sequences FOLDER, or --data.tube.scenes N")
         if not val:
-            raise InputError("nothing to validate on; give --data.val_sequences FOLDER, or --data.tube.val_scenes N")
+            raise InputError(
+                "data", "nothing to validate on", "give --data.val_sequences FOLDER, or --data.tube.val_scenes N"
+            )
         self._train, self._val = ConcatDataset(train), ConcatDataset(val)
 
     def share(self, other: FrameDataModule) -> bool:
@@ -172,7 +182,7 @@ class FrameDataModule(pl.LightningDataModule):
             return [[(path, None) for path in paths] for paths in (self.sequences, self.val_sequences)]
         split = read_split(Path(self.split))
         if "train" not in split.parts:
-            raise InputError(f"{self.split}: no train in it; it is a split to test with, not to train with")
+            raise InputError(self.split, "no train in it: it is a split to test with", "expected one to train with")
         assert self.config.root is not None
         found = folders(split, Path(self.config.root), ("train", "val"))
         both: list[list[tuple[str, Listed | None]]] = [

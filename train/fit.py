@@ -70,9 +70,13 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         if not 0 <= self.ema < 1 or self.patience < 0:
-            raise InputError(f"fit: ema {self.ema}, patience {self.patience}; expected 0 <= ema < 1 and patience >= 0")
+            raise InputError(
+                "fit", f"ema {self.ema}, patience {self.patience}", "expected 0 <= ema < 1 and patience >= 0"
+            )
         if self.patience and self.monitor == "last":
-            raise InputError("fit: patience without a criterion; set fit.monitor to loss, photometric or inconsistency")
+            raise InputError(
+                "fit", "patience without a criterion", "set fit.monitor to loss, photometric or inconsistency"
+            )
 
 
 _FIT = FitConfig()
@@ -81,13 +85,13 @@ _FIT = FitConfig()
 def check_output(output: Path, resume: bool, overwrite: bool) -> None:
     """Raises InputError when the folder holds a run and neither flag says what to do with it."""
     if resume and overwrite:
-        raise InputError("--resume and --overwrite contradict each other; give one of them")
+        raise InputError("--resume, --overwrite", "they contradict each other", "give one of them")
     if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; expected a folder to write the run to")
+        raise InputError(output, "is a file", "expected a folder to write the run to")
     complete, begun = (output / "run.json").exists(), (output / "checkpoints" / "last.ckpt").exists()
     if (complete or begun) and not resume and not overwrite:
         state = "complete" if complete else "unfinished"
-        raise InputError(f"{output}: holds a {state} run; --resume continues it, --overwrite starts anew")
+        raise InputError(output, f"holds a {state} run", "--resume continues it, --overwrite starts anew")
 
 
 def fit(
@@ -110,8 +114,9 @@ def fit(
     """
     if trainer_options.get("precision") not in _PRECISIONS:
         raise InputError(
-            f"trainer.precision {trainer_options['precision']}: the physics of light needs float32; "
-            "expected 32-true, 16-mixed or bf16-mixed"
+            "trainer.precision",
+            f"{trainer_options['precision']}, but the physics of light needs float32",
+            "expected 32-true, 16-mixed or bf16-mixed",
         )
     check_output(output, resume, overwrite)
     started = time.time()

@@ -17,10 +17,14 @@ def read_frame_list(path: Path) -> list[str]:
     try:
         lines = [line.strip() for line in path.read_text().splitlines()]
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a list of frame names ({error})") from error
+        raise InputError(
+            path,
+            f"cannot be read as a list of frame names ({error})",
+            "expected one a line, as `lightdepth select` writes",
+        ) from error
     names = [line for line in lines if line and not line.startswith("#")]
     if not names:
-        raise InputError(f"{path}: no frame names in it; expected one a line, as `lightdepth select` writes")
+        raise InputError(path, "no frame names in it", "expected one a line, as `lightdepth select` writes")
     return names
 
 
@@ -43,7 +47,9 @@ def open_listed(source: Callable[..., SequenceSource], path: str, of: Listed | N
     rows = [i for i, number in enumerate(frames.numbers) if of.chosen.takes(number)]
     if not rows:
         raise InputError(
-            f"{path}: no frame in {of.chosen}; its numbers are {frames.numbers[0]} to {frames.numbers[-1]}"
+            path,
+            f"no frame in {of.chosen}",
+            f"choose others: its numbers are {frames.numbers[0]} to {frames.numbers[-1]}",
         )
     return frames.at(rows)
 
@@ -65,12 +71,18 @@ def listed_rows(path: Path, sequences: Mapping[str, FrameSequence]) -> dict[str,
         ends = {where: Path(where).resolve().parts[-len(folders) :] == tuple(folders) for where in sequences}
         found[entry] = [(where, i) for where, i in known.get(_stem(name), []) if not folders or ends[where]]
     if not any(found.values()):
-        raise InputError(f"{path}: none of the {len(found)} listed frames is in {' or '.join(sequences)}")
+        raise InputError(
+            path,
+            f"none of the {len(found)} listed frames is in {' or '.join(sequences)}",
+            "give the list of these sequences",
+        )
     for entry, places in found.items():
         if not places:
-            raise InputError(f"{path}: {entry} is not a frame of {' or '.join(sequences)}")
+            raise InputError(
+                path, f"{entry} is not a frame of {' or '.join(sequences)}", "take it out, or give its sequence too"
+            )
         if len(places) > 1:
-            raise InputError(f"{path}: {entry} is in {' and in '.join(w for w, _ in places)}; write folder/name")
+            raise InputError(path, f"{entry} is in {' and in '.join(w for w, _ in places)}", "write folder/name")
         rows[places[0][0]].add(places[0][1])
     return {where: sorted(chosen) for where, chosen in rows.items()}
 

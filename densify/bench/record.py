@@ -96,7 +96,7 @@ def read_bench(path: Path) -> BenchFile:
     path = path / "bench.json" if path.is_dir() else path
     data = read_json(path)
     if not isinstance(data, dict) or data.get("kind") != "bench":
-        raise InputError(f"{path}: not a result of lightdepth bench; expected its bench.json, or the folder it is in")
+        raise InputError(path, "not a result of lightdepth bench", "expected its bench.json, or the folder it is in")
     found = checked_fields(BenchFile, data, str(path))
     for cell in found.cells:
         for name, row in cell.rows.items():
@@ -105,8 +105,9 @@ def read_bench(path: Path) -> BenchFile:
                 value, least = row.get(key), 0 if key in _ALSO_COMPARED else 1e-9
                 if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value < np.inf:
                     raise InputError(
-                        f"{path}: {cell.scene} at {cell.wrong_share:.0%} wrong points, row {name!r}: {key} is "
-                        f"{value!r}; expected a number {'of at least 0' if least == 0 else 'above 0'}"
+                        path,
+                        f"{cell.scene} at {cell.wrong_share:.0%} wrong points, row {name!r}: {key} is {value!r}",
+                        f"expected a number {'of at least 0' if least == 0 else 'above 0'}",
                     )
     return found
 

@@ -144,26 +144,33 @@ def compare(a: BenchFile, b: BenchFile, seed: int = 0) -> Comparison:
     seeds that are the same in part, or no row in common."""
     if a.suite_version != b.suite_version:
         raise InputError(
-            f"suite version {a.suite_version} in A, {b.suite_version} in B: their scenes differ; run both again with "
-            "one version of the program"
+            "suite version",
+            f"{a.suite_version} in A, {b.suite_version} in B: their scenes differ",
+            "run both again with one version of the program",
         )
     for key in ("size", "image_size", "screening_share"):
         if a.config.get(key) != b.config.get(key):
-            raise InputError(f"{key} {a.config.get(key)} in A, {b.config.get(key)} in B; run both with the same")
+            raise InputError(key, f"{a.config.get(key)} in A, {b.config.get(key)} in B", "run both with the same")
     places = [{(c.scene, c.wrong_share): c for c in run.cells} for run in (a, b)]
     if set(places[0]) != set(places[1]):
         scene, share = sorted(set(places[0]) ^ set(places[1]))[0]
         which = "A" if (scene, share) in places[0] else "B"
-        raise InputError(f"{scene} at {share:.0%} wrong points is in {which} alone; run both with the same shares")
+        raise InputError(which, f"{scene} at {share:.0%} wrong points is in it alone", "run both with the same shares")
     same = [name for name, number in a.seeds.items() if b.seeds[name] == number]
     if same and len(same) < len(a.seeds):
         raise InputError(
-            f"{len(same)} of {len(a.seeds)} scenes have the same seed in both runs; expected all (paired) or none"
+            "seeds of A and B",
+            f"{len(same)} of {len(a.seeds)} scenes have the same seed in both runs",
+            "expected all (paired) or none",
         )
     rows = [list(dict.fromkeys(r for c in run.cells for r in c.rows if r not in (SPARSE, INLIERS))) for run in (a, b)]
     common = [row for row in rows[0] if row in rows[1]]
     if not common:
-        raise InputError(f"no row is in both: A has {'; '.join(rows[0])}; B has {'; '.join(rows[1])}")
+        raise InputError(
+            "rows of A and B",
+            "none is in both",
+            f"run both with the same: A has {'; '.join(rows[0])}; B has {'; '.join(rows[1])}",
+        )
     spread = SAME_COLONS if same else OTHER_COLONS
     tail = (1 - LEVEL) / 2 / (len(common) * len(spread.deviation))
     judged: list[Judged] = []
@@ -177,7 +184,9 @@ def compare(a: BenchFile, b: BenchFile, seed: int = 0) -> Comparison:
             if found is not None:
                 judged.append(found)
     if not judged:
-        raise InputError("no row has figures for the same scenes in both runs; their bench.md say why")
+        raise InputError(
+            "rows of A and B", "none has figures for the same scenes in both runs", "their bench.md say why"
+        )
     unmatched = tuple(row for row in dict.fromkeys((*rows[0], *rows[1])) if row not in common)
     return Comparison(bool(same), tuple(judged), _changed(a.config, b.config), unmatched)
 

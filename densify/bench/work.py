@@ -60,13 +60,13 @@ class BenchConfig:
         for name in ("wrong_shares", "checkpoints", "recipes"):
             given = getattr(self, name)
             if not given or len(set(given)) < len(given):
-                raise InputError(f"{name} {list(given)}; expected at least one, and none twice")
+                raise InputError(name, f"{list(given)}", "expected at least one, and none twice")
         if not all(0 <= share < 1 for share in (*self.wrong_shares, self.screening_share)):
-            raise InputError(f"wrong_shares {list(self.wrong_shares)}; expected shares of at least 0 and below 1")
+            raise InputError("wrong_shares", f"{list(self.wrong_shares)}", "expected shares of at least 0 and below 1")
         if min(self.image_size) < 32:
-            raise InputError(f"image_size {list(self.image_size)}; expected at least 32 pixels each way")
+            raise InputError("image_size", f"{list(self.image_size)}", "expected at least 32 pixels each way")
         if self.first_seed < 0:
-            raise InputError(f"first_seed {self.first_seed}; expected 0 or more")
+            raise InputError("first_seed", f"{self.first_seed}", "expected 0 or more")
 
     def shares(self, scene: Scene) -> tuple[float, ...]:
         return self.wrong_shares if scene.maps == 1 else (self.screening_share,)
@@ -91,7 +91,9 @@ def load_models(checkpoints: Sequence[str]) -> list[DepthModel]:
     names = [model.name for model in models]
     twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
     if twice is not None:
-        raise InputError(f"two checkpoints are called {twice}; rows are named after them: rename one of the files")
+        raise InputError(
+            "--checkpoint", f"two are called {twice}", "rename one of the files: rows are named after them"
+        )
     return models
 
 

@@ -49,7 +49,7 @@ def densify(
         overwrite: Replace a run made before.
     """
     if "ply" not in formats:
-        raise InputError(f"--formats {list(formats)}; expected ply, and besides it glb and obj if wanted")
+        raise InputError("--formats", f"{list(formats)}", "expected ply, and besides it glb and obj if wanted")
     check_unit(mm_per_unit)
     model = load_model(checkpoint, details=False)  # before minutes are spent on a sparse map
     arguments = recorded(

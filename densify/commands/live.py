@@ -49,9 +49,9 @@ def live(
     """
     check_unit(mm_per_unit)
     if not budget_ms > 0:
-        raise InputError(f"--budget-ms {budget_ms}; expected milliseconds above 0")
+        raise InputError("--budget-ms", f"{budget_ms}", "expected milliseconds above 0")
     if rate is not None and not rate > 0:
-        raise InputError(f"--rate {rate}; expected keyframes per second, above 0")
+        raise InputError("--rate", f"{rate}", "expected keyframes per second, above 0")
     model = load_model(checkpoint, details=False)
     arguments = recorded(
         source,

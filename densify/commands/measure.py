@@ -42,7 +42,11 @@ def measure(
     dense = chosen_map(read_run(run), map, run)
     unit = run_unit(run, mm_per_unit)
     if (points is None) == (pixels is None) or (pixels is None) != (frame is None):
-        raise InputError("give the places either by --points, or by --frame and --pixels")
+        raise InputError(
+            "--points, --frame, --pixels",
+            "places given twice, or in part",
+            "give the places either by --points, or by --frame and --pixels",
+        )
     if points is not None:
         places = np.asarray(points, float).reshape(-1, 3)
     else:

@@ -52,7 +52,7 @@ def _poses(given: str, frames: FrameSequence) -> dict[int, np.ndarray]:
         found = ((f.number, f.true_world_from_cam) for f in frames)
         known = {number: pose for number, pose in found if pose is not None}
         if not known:
-            raise InputError(f"{frames.source}: no frame has a pose; give --poses FILE, a TUM trajectory")
+            raise InputError(frames.source, "no frame has a pose", "give --poses FILE, a TUM trajectory")
         return known
     times, poses = read_tum(Path(given))
     return dict(zip(times.round().astype(int).tolist(), poses, strict=True))

@@ -59,7 +59,7 @@ def sideways_agreement(source: np.ndarray, target: np.ndarray, similarity: Simil
 def closest(points: np.ndarray, tree: cKDTree) -> np.ndarray:
     """Distance (n,) from each point (n, 3) to the closest point of the tree. Raises InputError without points."""
     if not len(points):
-        raise InputError("the model has no points")
+        raise InputError("the model", "it has no points", "expected at least one")
     result: np.ndarray = tree.query(points, workers=-1)[0]
     return result
 
@@ -73,7 +73,7 @@ def thinned(points: np.ndarray, cube: float) -> np.ndarray:
         return points
     cell = np.floor(points / cube)
     if not np.abs(cell).max() < 1 << 20:  # three numbers of 21 bits make a key
-        raise InputError(f"the true surface reaches {np.abs(points).max() / 1000:.0f} m; are its poses in mm?")
+        raise InputError("the true surface", f"it reaches {np.abs(points).max() / 1000:.0f} m", "are its poses in mm?")
     off = np.square(points / cube - cell - 0.5).sum(1)
     x, y, z = cell.astype(np.int64).T + (1 << 20)
     key = (x << 42) | (y << 21) | z
@@ -117,7 +117,9 @@ def true_cloud(frames: Iterable[Frame], stride: int = 2, cube: float = CUBE_MM) 
             clouds, waiting = [thinned(np.concatenate(clouds), cube)], 0
     cloud = thinned(np.concatenate(clouds), cube)
     if not len(cloud):
-        raise InputError("no frame has both valid true distance and a true pose; there is no truth to compare with")
+        raise InputError(
+            "the truth", "no frame has both valid true distance and a true pose", "give a sequence that has both"
+        )
     return cloud
 
 
@@ -243,7 +245,7 @@ def check_numbers(frame: Frame) -> None:
     """Raises InputError where the true distance is no number: readers give 0 for what is unknown."""
     bad = 0 if frame.true_distance is None else int((~np.isfinite(frame.true_distance)).sum())
     if bad:
-        raise InputError(f"{frame.name}: the true depth is NaN or infinite at {bad} pixels; expected 0 where unknown")
+        raise InputError(frame.name, f"the true depth is NaN or infinite at {bad} pixels", "expected 0 where unknown")
 
 
 def true_depth(frame: Frame, max_depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -258,26 +260,32 @@ def compare_depth(prediction: DepthPrediction, frame: Frame, max_depth_mm: float
     """A prediction against its frame's truth. Raises InputError where sizes differ, there is no truth to compare with,
     or the prediction has no number at a pixel that it calls valid."""
     if frame.true_distance is None:
-        raise InputError(f"{frame.name}: no true depth")
+        raise InputError(frame.name, "no true depth", "give a sequence that has it")
     if frame.true_distance.shape != prediction.distance.shape:
         h, w = prediction.distance.shape
         raise InputError(
-            f"{frame.name}: the prediction is {w}x{h}, the truth {frame.camera.width}x{frame.camera.height}; "
-            "predict at the size of the truth"
+            frame.name,
+            f"the prediction is {w}x{h}, the truth {frame.camera.width}x{frame.camera.height}",
+            "predict at the size of the truth",
         )
     bad = int((prediction.valid & ~np.isfinite(prediction.distance)).sum())
     if bad:
         raise InputError(
-            f"{frame.name}: the predicted depth is NaN or infinite at {bad} pixels that are marked valid; expected "
-            "numbers there"
+            frame.name,
+            f"the predicted depth is NaN or infinite at {bad} pixels that are marked valid",
+            "expected numbers there",
         )
     truth, known = true_depth(frame, max_depth_mm)
     if not known.any():
-        raise InputError(f"{frame.name}: the true depth is invalid everywhere (0, or at least {max_depth_mm:g} mm)")
+        raise InputError(
+            frame.name,
+            f"the true depth is invalid everywhere (0, or at least {max_depth_mm:g} mm)",
+            "expected mm; leave the frame out",
+        )
     predicted = depth_from_distance(prediction.distance, frame.camera.rays()[0][..., 2])
     common = known & prediction.valid & (predicted > 0)
     if not common.any():
-        raise InputError(f"{frame.name}: the prediction is valid nowhere where the truth is")
+        raise InputError(frame.name, "the prediction is valid nowhere where the truth is", "leave the frame out")
     return ComparedDepth(predicted, truth, common, float(common.mean()), float(common.sum() / known.sum()))
 
 
@@ -310,7 +318,7 @@ def surface_gap(first: DenseMapFiles, second: DenseMapFiles, second_from_first: 
     one, two = (np.concatenate(h) for h in hits)
     both = np.isfinite(one) & np.isfinite(two)
     if not both.any():
-        raise InputError("no ray meets both surfaces; is the Sim(3) right (second = scale · R first + t)?")
+        raise InputError("the two surfaces", "no ray meets both", "is the Sim(3) right (second = scale · R first + t)?")
     gap = np.abs(one[both] - two[both]) / one[both]
     either = np.isfinite(one) | np.isfinite(two)
     return Gap(int(both.sum()), float(np.median(gap)), float(np.quantile(gap, 0.9)), float(both.sum() / either.sum()))

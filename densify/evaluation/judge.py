@@ -53,7 +53,7 @@ def judge_maps(
         try:
             shared_frames(m.trajectory.numbers.tolist(), truth.numbers, "poses", truth.source, common)
         except InputError as error:
-            raise InputError(f"map {m.trajectory.id}: {error}") from error
+            raise error.within(f"map {m.trajectory.id}") from error
     maps: list[MapFigures] = []
     aligned: list[AlignedTrajectory] = []
     errors: dict[str, list[SurfaceErrors]] = {name: [] for name in _CLOUDS}
@@ -91,10 +91,12 @@ def judge_maps(
                 meshes.append(ErrorMesh(f"map_{m.trajectory.id:03d}", points, m.triangles, distances.accuracy))
         maps.append(replace(alone, clouds=clouds))
     if not aligned:
-        raise InputError(f"no map could be evaluated; map {maps[0].map_id}: {maps[0].error}")
+        raise InputError(f"map {maps[0].map_id}", f"{maps[0].error}", "expected one map at least that can be evaluated")
     refused = [m for m in maps if m.surface_error]
     if refused and len(refused) == len(aligned) and truth.surface is not None:
-        raise InputError(f"no map could be evaluated; map {refused[0].map_id}: {refused[0].surface_error}")
+        raise InputError(
+            f"map {refused[0].map_id}", f"{refused[0].surface_error}", "expected one map at least that can be evaluated"
+        )
     made = {name: pooled(found) for name, found in errors.items() if found}
     trajectory = trajectory_summary(aligned, [m.trajectory for m in models], truth.numbers)
     judged = MapsJudged(
@@ -141,12 +143,16 @@ def judge_gap(maps: Sequence[DenseMapFiles], join: Path) -> MapGap:
         sim = Similarity(float(data["scale"]), rotation, np.asarray(data["translation"], float).reshape(3))
         first, second = int(data["first"]), int(data["second"])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{join}: expected first, second, scale, rotation, translation ({error!r})") from error
+        raise InputError(
+            join,
+            f"a field is missing or of another kind ({error!r})",
+            "expected first, second, scale, rotation, translation",
+        ) from error
     if not (np.isfinite(sim.scale) and sim.scale > 0):
-        raise InputError(f"{join}: scale {sim.scale}; expected a positive number")
+        raise InputError(join, f"scale {sim.scale}", "expected a positive number")
     check_rigid(np.vstack([np.column_stack([sim.rotation, sim.translation]), [0, 0, 0, 1]]), f"{join}: rotation")
     by_id = {m.id: m for m in maps}
     missing = [i for i in (first, second) if i not in by_id]
     if missing:
-        raise InputError(f"{join}: map {missing[0]} is not in the run, which has {sorted(by_id)}")
+        raise InputError(join, f"map {missing[0]} is not in the run", f"expected one of {sorted(by_id)}")
     return MapGap(first, second, surface_gap(by_id[first], by_id[second], sim))

@@ -50,7 +50,9 @@ def judge_depth(
             curves.append(found.within(EDGES_MM, alignment))
         units.add(prediction.unit)
     if not rows:
-        raise InputError(f"{truth.source}: no frame has valid true depth; the first: {next(iter(skipped.values()))}")
+        raise InputError(
+            truth.source, "no frame has valid true depth", f"begin with the first: {next(iter(skipped.values()))}"
+        )
     judged = DepthJudged(
         predicted_unit=", ".join(sorted(units)),
         alignment=ALIGNMENTS,

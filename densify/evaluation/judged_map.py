@@ -35,7 +35,7 @@ def read_run(folder: Path) -> list[DenseMapFiles]:
     """The dense maps of a densify run, or of one of its map folders. Raises InputError when there are none."""
     maps = [read_dense_map(f) for f in map_folders(folder)]
     if not maps:
-        raise InputError(f"{folder}: neither map_* folders (a densify run) nor .npz files (predictions)")
+        raise InputError(folder, "neither map_* folders nor .npz files in it", "expected a densify run, or predictions")
     return maps
 
 
@@ -62,7 +62,9 @@ def with_trajectories(models: Sequence[JudgedMap], trajectories: Sequence[Trajec
     by_id = {t.id: t for t in trajectories}
     missing = [m.trajectory.id for m in models if m.trajectory.id not in by_id]
     if missing:
-        raise InputError(f"map {missing[0]} has no trajectory; there are those of {sorted(by_id)}")
+        raise InputError(
+            f"map {missing[0]}", "it has no trajectory", f"expected one of each map; there are those of {sorted(by_id)}"
+        )
     return [JudgedMap(by_id[m.trajectory.id], m.clouds, m.triangles) for m in models]
 
 
@@ -80,8 +82,10 @@ def read_models(path: Path, trajectory: Path | None = None) -> list[JudgedMap]:
             if path.is_dir() and trajectory_files(path):
                 return [JudgedMap(t) for t in read_trajectories(path)]
             raise InputError(
-                f"{path}: neither map_* folders (a densify run) nor .npz files (predictions) nor a trajectory, and no "
-                f"map: {error}"
+                path,
+                "neither map_* folders (a densify run) nor .npz files (predictions) nor a trajectory, and no map: "
+                f"{error.found}",
+                error.cure,
             ) from error
         trajectory = trajectory or (path if trajectory_files(path) else None)
     return models if trajectory is None else with_trajectories(models, read_trajectories(trajectory))

@@ -76,7 +76,7 @@ def read_suite(path: Path) -> Suite:
     for group in found.groups:
         for column, folder in group.sequences.items():
             if column in folders or folder in folders.values():
-                raise InputError(f"{path}: {column} ({folder}) is there twice; leave one")
+                raise InputError(path, f"{column} ({folder}) is there twice", "leave one")
             folders[column] = folder
     rows = [(r, v, groups) for r, v in found.published.trajectory.items()]
     rows += [(f"{m}: {r}", v, surface) for m, of in found.published.surface.items() for r, v in of.items()]
@@ -84,13 +84,14 @@ def read_suite(path: Path) -> Suite:
         expected = sum(len(g) + (len(g) > 1) for g in of)
         if len(values) != expected:
             raise InputError(
-                f"{path}: published row {row!r} has {len(values)} values; expected {expected}: each sequence, and the "
-                "mean of each group"
+                path,
+                f"published row {row!r} has {len(values)} values",
+                f"expected {expected}: each sequence, and the mean of each group",
             )
     for method, errors in found.published.depth.items():
         odd = sorted(set(errors) - set(NAMES))
         if odd:
-            raise InputError(f"{path}: published depth of {method}: {odd[0]}; expected one of {', '.join(NAMES)}")
+            raise InputError(path, f"published depth of {method}: {odd[0]}", f"expected one of {', '.join(NAMES)}")
     p = found.published
     return Suite(groups, surface, folders, found.fps, p.trajectory, p.surface, p.depth)
 
@@ -109,5 +110,9 @@ def present(suite: Suite, runs: Path, truth: Path) -> tuple[dict[str, tuple[Path
             where = [str(root) for root, found in ((runs, run), (truth, sequence)) if found is None]
             missing[column] = f"{folder} is not in {' nor in '.join(where)}"
     if not pairs:
-        raise InputError(f"no sequence of the suite is there: {'; '.join(missing.values())}")
+        raise InputError(
+            "the suite",
+            f"no sequence of it is there: {'; '.join(missing.values())}",
+            "expected folders named as in the suite",
+        )
     return pairs, missing

@@ -43,7 +43,11 @@ class Trajectory:
         step = np.diff(self.numbers)
         if not (step > 0).all():
             assert (step >= 0).all(), "numbers must ascend"
-            raise InputError(f"map {self.id}: frame {self.numbers[1:][step == 0][0]} is in its trajectory twice")
+            raise InputError(
+                f"map {self.id}",
+                f"frame {self.numbers[1:][step == 0][0]} is in its trajectory twice",
+                "expected one pose a frame",
+            )
 
 
 def in_order(
@@ -85,7 +89,7 @@ def read_trajectories(path: Path) -> list[Trajectory]:
     files = trajectory_files(path)
     if not files:
         raise InputError(
-            f"{path}: no trajectory; expected a TUM file (t tx ty tz qx qy qz qw) or CLiMB's cam_traj_map_*.txt"
+            path, "no trajectory", "expected a TUM file (t tx ty tz qx qy qz qw) or CLiMB's cam_traj_map_*.txt"
         )
     return [_read(file) for file in files]
 
@@ -112,7 +116,7 @@ def _read(file: Path) -> Trajectory:
         centers = list(map_from_cam[:, :3, 3])
         keyframe, whole = [True] * len(numbers), "keyframe" not in file.name.lower()
     if not numbers:
-        raise InputError(f"{file}: no pose in it; expected at least three")
+        raise InputError(file, "no pose in it", "expected at least three")
     return in_order(map_id, numbers, np.stack(centers), keyframe, whole)
 
 
@@ -145,7 +149,9 @@ def align_trajectory(
     known = np.array([n in true_poses for n in trajectory.numbers.tolist()])
     if not known.any():
         raise InputError(
-            f"none of its poses has a true one; truth has {span(list(true_poses))}, the map {span(trajectory.numbers)}"
+            "the trajectory",
+            f"none of its poses has a true one: truth has {span(list(true_poses))}, the map {span(trajectory.numbers)}",
+            "do both count from the same frame?",
         )
     numbers, centers = trajectory.numbers[known], trajectory.centers[known]
     true = np.stack([true_poses[n][:3, 3] for n in numbers.tolist()])

@@ -71,7 +71,7 @@ def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bo
         if any_depth and with_surface:
             raise
     if not poses:
-        raise InputError(f"{frames.source}: no frame has a true pose; a trajectory or a surface needs them")
+        raise InputError(frames.source, "no frame has a true pose", "give them: a trajectory or a surface needs them")
     period = float(np.median(np.diff(times))) if len(times) > 1 else None
     common = (frames.source, poses, sorted(frames.numbers), period)
     if cloud is None:
@@ -93,8 +93,9 @@ def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bo
         off = float(np.median(surface.distance(cloud[:: max(1, len(cloud) // 5000)])))
         if off > 2:
             raise InputError(
-                f"{mesh}: the true depth is {off:.3g} mm from it (median); expected the surface that the sequence "
-                "shows, in mm, in the frame of reference of its poses"
+                mesh,
+                f"the true depth is {off:.3g} mm from it (median)",
+                "expected the surface that the sequence shows, in mm, in the frame of reference of its poses",
             )
     return Truth(*common, TrueSurface(cloud, sampling, surface, source))
 
@@ -104,14 +105,16 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
     if not path.is_file():
-        raise InputError(f"{path}: no such mesh")
+        raise InputError(path, "no such mesh", "correct its name, or put it there")
     try:
         mesh: Any = trimesh.load(path, process=False, force="mesh", skip_materials=True)
         vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, int)
     except Exception as error:  # whatever a broken file makes the reader stumble over
-        raise InputError(f"{path}: not a mesh that can be read ({type(error).__name__}: {error})") from error
+        raise InputError(
+            path, f"not a mesh that can be read ({type(error).__name__}: {error})", "expected a PLY, OBJ, STL or GLB"
+        ) from error
     if not len(triangles):
-        raise InputError(f"{path}: no triangles in it")
+        raise InputError(path, "no triangles in it", "expected a surface, not points alone")
     return vertices, triangles
 
 
@@ -122,15 +125,17 @@ def shared_frames(ours: Collection[int], theirs: Sequence[int], what: str, sourc
     both = [n for n in mine if n in known]
     if not both:
         raise InputError(
-            f"{source}: none of its frames is among the {what}: it has {span(theirs)}, they are for {span(mine)}; do "
-            "both count from the same frame? (frame_offset in densify_map.json shifts a map's)"
+            source,
+            f"none of its frames is among the {what}: it has {span(theirs)}, they are for {span(mine)}",
+            "do both count from the same frame? (frame_offset in densify_map.json shifts a map's)",
         )
     if len(both) < len(mine) and not common:
         alone = [n for n in mine if n not in known]
         raise InputError(
-            f"{source}: it has {span(theirs)}, the {what} are for {span(mine)}: {len(both)} match ({span(both)}), "
-            f"{len(alone)} do not ({_listed(alone)}). Give the truth of the same frames, or --common to judge those "
-            "that match"
+            source,
+            f"it has {span(theirs)}, the {what} are for {span(mine)}: {len(both)} match ({span(both)}), {len(alone)} "
+            f"do not ({_listed(alone)})",
+            "give the truth of the same frames, or --common to judge those that match",
         )
     return both
 

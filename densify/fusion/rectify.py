@@ -56,7 +56,7 @@ class RectifyConfig:
 
     def __post_init__(self) -> None:
         if self.field not in ("whole", "pinhole"):
-            raise InputError(f"field {self.field!r}; expected whole or pinhole")
+            raise InputError("field", f"{self.field!r} is not known", "expected whole or pinhole")
 
 
 @dataclass(frozen=True)

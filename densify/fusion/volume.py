@@ -75,7 +75,7 @@ class TsdfVolume:
 
     def __init__(self, voxel: float, config: FusionConfig = FusionConfig()):
         if not np.isfinite(voxel) or voxel <= 0:
-            raise InputError(f"voxel size {voxel}; expected a positive length in map units")
+            raise InputError("voxel size", f"{voxel}", "expected a positive length in map units")
         self.voxel = voxel
         self.views = 0
         self._config = config
@@ -144,14 +144,16 @@ class TsdfVolume:
         farthest = BLOCK * np.abs(np.array([low, high], np.int64)).max()
         if farthest >= REACH - 2 * BLOCK:
             raise InputError(
-                f"voxel size {self.voxel:.3g}: one view reaches {farthest} voxels from the map's origin; at most "
-                f"{REACH} are possible: choose larger voxels"
+                "voxel size",
+                f"at {self.voxel:.3g} one view reaches {farthest} voxels from the map's origin",
+                f"at most {REACH} are possible: choose larger voxels",
             )
         shape = high - low + 1
         if np.prod(shape.astype(float)) > 1e8:
             raise InputError(
-                f"voxel size {self.voxel:.3g}: one view spans {' x '.join(map(str, shape))} blocks of {BLOCK} voxels; "
-                "choose larger voxels"
+                "voxel size",
+                f"at {self.voxel:.3g} one view spans {' x '.join(map(str, shape))} blocks of {BLOCK} voxels",
+                "choose larger voxels",
             )
         touched = np.zeros(shape, bool)
         _mark(touched, near, low)

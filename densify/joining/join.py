@@ -79,7 +79,9 @@ class MergeConfig:
     def __post_init__(self) -> None:
         unknown = set(self.by) - set(WAYS)
         if unknown:
-            raise InputError(f"merging.by {', '.join(sorted(unknown))}; expected some of {', '.join(WAYS)}")
+            raise InputError(
+                "merging.by", f"{', '.join(sorted(unknown))} not known", f"expected some of {', '.join(WAYS)}"
+            )
 
 
 @dataclass(frozen=True)

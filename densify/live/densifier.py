@@ -140,12 +140,13 @@ class Densifier:
         of keyframe.point_ids. Raises InputError, and changes nothing, where these do not fit.
         """
         if keyframe.name in self._kept:
-            raise InputError(f"keyframe {keyframe.name}: already there; its pose is changed by update_poses")
+            raise InputError(f"keyframe {keyframe.name}", "already there", "its pose is changed by update_poses")
         points = np.asarray(points, np.float64)
         if points.shape != (len(keyframe.point_ids), 3):
             raise InputError(
-                f"keyframe {keyframe.name}: points of shape {points.shape}; expected ({len(keyframe.point_ids)}, 3), "
-                "one for each point that it observed"
+                f"keyframe {keyframe.name}",
+                f"points of shape {points.shape}",
+                f"expected ({len(keyframe.point_ids)}, 3), one for each point that it observed",
             )
         frame = self._frame(image, keyframe)
         packing = Packing(frame.image)
@@ -174,7 +175,11 @@ class Densifier:
         """
         unknown = [name for name in poses if name not in self._kept]
         if unknown:
-            raise InputError(f"keyframe {unknown[0]}: not among the {len(self._kept)} of map {self.id}")
+            raise InputError(
+                f"keyframe {unknown[0]}",
+                f"not among the {len(self._kept)} of map {self.id}",
+                "expected one that was added",
+            )
         where = _Positions(point_ids, points)
         renewed: dict[str, _Kept] = {}
         for name, kept in self._kept.items():
@@ -188,7 +193,11 @@ class Densifier:
         """Takes out keyframes that the SLAM has culled. Raises InputError for one that is not there."""
         unknown = [name for name in names if name not in self._kept]
         if unknown:
-            raise InputError(f"keyframe {unknown[0]}: not among the {len(self._kept)} of map {self.id}")
+            raise InputError(
+                f"keyframe {unknown[0]}",
+                f"not among the {len(self._kept)} of map {self.id}",
+                "expected one that was added",
+            )
         for name in names:
             self._take_out(self._kept.pop(name))
 
@@ -208,7 +217,9 @@ class Densifier:
         new = {name: kept for name, kept in other._kept.items() if name not in self._kept}
         missing = [name for name in new if name not in poses]
         if missing:
-            raise InputError(f"keyframe {missing[0]}: its pose in map {self.id} is missing")
+            raise InputError(
+                f"keyframe {missing[0]}", f"its pose in map {self.id} is missing", "expected one for each keyframe"
+            )
         where = _Positions(point_ids, points)
         moved = {name: self._moved(kept, poses[name], where) for name, kept in new.items()}
         for kept in moved.values():
@@ -227,7 +238,7 @@ class Densifier:
     def dense_map(self) -> DenseMap:
         """The surface with all that it rests on, as densify makes it. Raises InputError while there is no keyframe."""
         if not self._kept:
-            raise InputError(f"map {self.id}: no keyframe yet")
+            raise InputError(f"map {self.id}", "no keyframe yet", "add one first")
         keyframes = tuple(kept.keyframe for kept in self._kept.values())
         # A point is where the last keyframe that observed it has it.
         ids = np.concatenate([k.point_ids for k in keyframes])[::-1]
@@ -340,13 +351,15 @@ class _Positions:
 
     def __init__(self, ids: np.ndarray | None, points: np.ndarray | None):
         if (ids is None) != (points is None):
-            raise InputError("point_ids without points, or the other way round; expected both or neither")
+            raise InputError("points", "point_ids without points, or the other way round", "expected both or neither")
         ids = np.zeros(0, int) if ids is None else np.asarray(ids)
         points = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
         if points.shape != (len(ids), 3):
-            raise InputError(f"points of shape {points.shape}; expected ({len(ids)}, 3), one for each of point_ids")
+            raise InputError("points", f"shape {points.shape}", f"expected ({len(ids)}, 3), one for each of point_ids")
         if not np.isfinite(points).all():
-            raise InputError(f"point {ids[~np.isfinite(points).all(1)][0]}: its position is not finite")
+            raise InputError(
+                f"point {ids[~np.isfinite(points).all(1)][0]}", "its position is not finite", "expected finite X Y Z"
+            )
         self._ids, first = np.unique(ids, return_index=True)
         self._points = points[first]
 

@@ -63,7 +63,7 @@ def play(
     earlier one is worked on; without, each comes when the last is done. Only one submap is held at a time.
     """
     if rate is not None and not rate > 0:
-        raise InputError(f"rate {rate}; expected keyframes per second, above 0")
+        raise InputError("rate", f"{rate}", "expected keyframes per second, above 0")
     submaps = sorted(sparse_map.submaps, key=lambda s: min(k.number for k in s.keyframes))
     Densifier(model, config).warm_up(submaps[0].keyframes[0].camera)
     played: list[Played] = []

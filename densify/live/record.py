@@ -63,7 +63,9 @@ class PlayedRun:
                 run.fail(f"map_{p.map:03d}, keyframe {p.keyframe}", p.reason)
         if not any(record.vertices for record in self._records):
             reasons = [f"{p.keyframe}: {p.reason}" for p in played if p.reason]
-            raise InputError(f"no keyframe of any map could be aligned; {'; '.join(reasons[:3])}")
+            raise InputError(
+                "the maps", "no keyframe of any could be aligned", f"begin with the first: {'; '.join(reasons[:3])}"
+            )
         write_timings(played, run.folder / "timings.csv")
         (run.folder / "timings.png").write_bytes(timings_picture(played, budget_ms / 1000))
         spent = time_spent(played, budget_ms / 1000)

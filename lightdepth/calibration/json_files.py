@@ -64,7 +64,11 @@ def light_from_text(text: str) -> PhotometricCalibration:
     where = f"--light {text}"
     pairs = [[side.strip() for side in part.split("=", 1)] for part in text.split(",")]
     if any(len(pair) != 2 for pair in pairs):
-        raise InputError(f"{where}: expected name=number pairs such as gamma=2.2,mu=0; vectors need a light.json")
+        raise InputError(
+            where,
+            "not pairs of a name and a number",
+            "expected name=number pairs such as gamma=2.2,mu=0; vectors need a light.json",
+        )
     return _light(dict(pairs), where)
 
 
@@ -78,7 +82,7 @@ def _light(data: Any, where: str) -> PhotometricCalibration:
     try:
         return PhotometricCalibration(**values)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise error.within(where) from error
 
 
 def write_light_json(light: PhotometricCalibration, path: Path) -> None:

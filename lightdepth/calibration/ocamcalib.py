@@ -39,27 +39,27 @@ def read_ocamcalib(path: Path) -> CameraModel:
     """The camera of a calib_results.txt."""
     lines = rows(read_text(path, f"expected {_LINES}"))
     if len(lines) != 5:
-        raise InputError(f"{path}: {len(lines)} lines of numbers; expected {_LINES}")
+        raise InputError(path, f"{len(lines)} lines of numbers", f"expected {_LINES}")
     names = ("polynomial", "inverse polynomial", "centre", "affine", "size")
     values = {n: to_numbers(w, f"{path}: {n}", "numbers") for n, w in zip(names, lines, strict=True)}
     count, *poly = values["polynomial"]
     if count != len(poly):
-        raise InputError(f"{path}: polynomial: {len(poly)} coefficients after the count {count:g}; expected as many")
+        raise InputError(path, f"polynomial: {len(poly)} coefficients after the count {count:g}", "expected as many")
     for name, right in (("centre", "row and column"), ("affine", "c, d and e"), ("size", "height and width")):
         if len(values[name]) != len(right.replace(" and", ",").split(", ")):
-            raise InputError(f"{path}: {name}: {len(values[name])} numbers; expected {right}")
+            raise InputError(f"{path}: {name}", f"{len(values[name])} numbers", f"expected {right}")
     if any(poly[5:]):
-        raise InputError(f"{path}: polynomial of degree {len(poly) - 1}; expected 4 at most (ocamcalib's default)")
+        raise InputError(path, f"polynomial of degree {len(poly) - 1}", "expected 4 at most (ocamcalib's default)")
     poly = (poly + [0.0] * 5)[:5]
     if poly[0] >= 0:
-        raise InputError(f"{path}: polynomial starts with {poly[0]:g}; expected a negative number, as ocamcalib has it")
+        raise InputError(path, f"polynomial starts with {poly[0]:g}", "expected a negative number, as ocamcalib has it")
     c, d, e = values["affine"]
     if abs(c - 1) > 0.5:
-        raise InputError(f"{path}: affine c = {c:g}; expected about 1, the ratio of the pixel's sides")
+        raise InputError(path, f"affine c = {c:g}", "expected about 1, the ratio of the pixel's sides")
     row, column = values["centre"]
     height, width = values["size"]
     if height != int(height) or width != int(width):
-        raise InputError(f"{path}: size {height:g} {width:g}; expected height and width in whole pixels")
+        raise InputError(path, f"size {height:g} {width:g}", "expected height and width in whole pixels")
     ours = [-a * c ** (1 - i) for i, a in enumerate(poly)]
     params = [column, row, *ours, 1 / c, e / c, d / c]
     return camera_from_params("SCARAMUZZA", int(width), int(height), params, str(path)).with_pixel_center(0.0)
@@ -70,7 +70,7 @@ def write_ocamcalib(camera: CameraModel, path: Path) -> None:
     if not isinstance(camera, Scaramuzza):
         raise cannot_hold(path, "ocamcalib", f"{camera.name} camera", "SCARAMUZZA")
     if not 2 / 3 <= camera.c <= 2:  # as the reader wants it
-        raise InputError(f"{path}: c = {camera.c:g}; ocamcalib's is about 1: resize the camera evenly both ways")
+        raise InputError(path, f"c = {camera.c:g}", "ocamcalib's is about 1: resize the camera evenly both ways")
     theirs = camera.with_pixel_center(1.0)
     c, d, e = 1 / camera.c, camera.e / camera.c, camera.d / camera.c
     polynomial = [-a * c ** (i - 1) for i, a in enumerate(theirs.params[2:7])]

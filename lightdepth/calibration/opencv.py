@@ -43,7 +43,7 @@ def read_opencv(path: Path) -> CameraModel:
     matrix = _numbers(fields, "camera_matrix", path)
     if len(matrix) != 9 or matrix[3] or matrix[6:] != [0, 0, 1] or abs(matrix[1]) > 1e-9:
         raise InputError(
-            f"{path}: camera_matrix: found {' '.join(f'{v:g}' for v in matrix)}; expected fx 0 cx / 0 fy cy / 0 0 1"
+            path, f"camera_matrix: found {' '.join(f'{v:g}' for v in matrix)}", "expected fx 0 cx / 0 fy cy / 0 0 1"
         )
     coefficients = _numbers(fields, "distortion_coefficients", path)
     model = str(fields.get("distortion_model") or "").lower()
@@ -57,7 +57,7 @@ def read_matrices(path: Path, names: tuple[str, ...]) -> dict[str, list[float]]:
     fields = _fields(path)
     missing = [name for name in names if fields.get(name.lower()) is None]
     if missing:
-        raise InputError(f"{path}: {', '.join(missing)} missing; expected the matrices {', '.join(names)}")
+        raise InputError(path, f"{', '.join(missing)} missing", f"expected the matrices {', '.join(names)}")
     return {name: _numbers(fields, name.lower(), path) for name in names}
 
 
@@ -69,9 +69,9 @@ def _fields(path: Path) -> dict[str, Any]:
     try:
         data = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())[:200]})") from error
+        raise InputError(path, f"not valid YAML ({' '.join(str(error).split())[:200]})", "correct it there") from error
     if not isinstance(data, dict):
-        raise InputError(f"{path}: no keys in it; expected camera_matrix, distortion_coefficients and the image size")
+        raise InputError(path, "no keys in it", "expected camera_matrix, distortion_coefficients and the image size")
     return {str(key).lower(): value for key, value in data.items()}
 
 
@@ -80,20 +80,23 @@ def _distortion(model: str, found: list[float], path: Path) -> tuple[str, list[f
     where = f"{path}: distortion_coefficients"
     if model in _FISHEYE:
         if len(found) != 4:
-            raise InputError(f"{where}: {len(found)} numbers; the model {model} has 4: k1 k2 k3 k4")
+            raise InputError(where, f"{len(found)} numbers", f"the model {model} has 4: k1 k2 k3 k4")
         return KannalaBrandt.name, found
     if model not in _BROWN:
         raise InputError(
-            f"{path}: distortion_model {model!r} is not known; expected plumb_bob (k1 k2 p1 p2), or fisheye or "
-            "equidistant (k1 k2 k3 k4)"
+            path,
+            f"distortion_model {model!r} is not known",
+            "expected plumb_bob (k1 k2 p1 p2), or fisheye or equidistant (k1 k2 k3 k4)",
         )
     if len(found) not in (4, 5):
         raise InputError(
-            f"{where}: {len(found)} numbers; expected k1 k2 p1 p2, or with k3 = 0 after them. Calibrate without the "
-            "rational, thin-prism and tilted terms"
+            where,
+            f"{len(found)} numbers",
+            "expected k1 k2 p1 p2, or with k3 = 0 after them. Calibrate without the rational, thin-prism and tilted "
+            "terms",
         )
     if len(found) == 5 and found[4]:
-        raise InputError(f"{where}: k3 = {found[4]:g}; expected 0: calibrate with cv2.CALIB_FIX_K3")
+        raise InputError(where, f"k3 = {found[4]:g}", "expected 0: calibrate with cv2.CALIB_FIX_K3")
     if not any(found):
         return Pinhole.name, []
     if len(found) == 4 and not model:
@@ -108,8 +111,9 @@ def _distortion(model: str, found: list[float], path: Path) -> tuple[str, list[f
 def _field(fields: dict[str, Any], key: str, path: Path) -> Any:
     if fields.get(key) is None:
         raise InputError(
-            f"{path}: {key} missing; expected image_width, image_height, camera_matrix, "
-            "distortion_coefficients (zeros for none)"
+            path,
+            f"{key} missing",
+            "expected image_width, image_height, camera_matrix, distortion_coefficients (zeros for none)",
         )
     return fields[key]
 
@@ -117,7 +121,7 @@ def _field(fields: dict[str, Any], key: str, path: Path) -> Any:
 def _size(fields: dict[str, Any], key: str, path: Path) -> int:
     (value,) = to_numbers([str(_field(fields, key, path))], f"{path}: {key}", "a number of pixels")
     if value != int(value):
-        raise InputError(f"{path}: {key} {value:g}; expected whole pixels")
+        raise InputError(path, f"{key} {value:g}", "expected whole pixels")
     return int(value)
 
 
@@ -127,13 +131,17 @@ def _numbers(fields: dict[str, Any], key: str, path: Path) -> list[float]:
     if isinstance(value, dict):
         data = value.get("data")
         if not isinstance(data, list):
-            raise InputError(f"{path}: {key}: data missing; expected rows, cols and data: [...]")
+            raise InputError(f"{path}: {key}", "data missing", "expected rows, cols and data: [...]")
         shape = [str(value[k]) for k in ("rows", "cols") if k in value]
         if len(shape) == 2 and np.prod(to_numbers(shape, f"{path}: {key}", "rows and cols")) != len(data):
-            raise InputError(f"{path}: {key}: {len(data)} numbers for {shape[0]} rows of {shape[1]}")
+            raise InputError(
+                f"{path}: {key}",
+                f"{len(data)} numbers for {shape[0]} rows of {shape[1]}",
+                "expected a number for each place",
+            )
         value = data
     if not isinstance(value, list):
-        raise InputError(f"{path}: {key}: found {str(value)[:40]!r}; expected a matrix")
+        raise InputError(f"{path}: {key}", f"found {str(value)[:40]!r}", "expected a matrix")
     flat = [v for row in value for v in (row if isinstance(row, list) else [row])]
     return to_numbers([str(v) for v in flat], f"{path}: {key}", "numbers")
 

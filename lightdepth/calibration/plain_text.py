@@ -21,8 +21,9 @@ from lightdepth.files.writing import write_whole
 def cannot_hold(path: Path, program: str, what: str, *models: str) -> InputError:
     """The error for a camera that a format has no place for, with the models that it has."""
     return InputError(
-        f"{path}: {program} has no {what}; it can be converted to {' or '.join(models)}: "
-        f"lightdepth convert-camera FILE -o OUT --model {models[0]}"
+        path,
+        f"{program} has no {what}",
+        f"it can be converted to {' or '.join(models)}: lightdepth convert-camera FILE -o OUT --model {models[0]}",
     )
 
 
@@ -31,8 +32,9 @@ def read_colmap_camera(path: Path) -> CameraModel:
     cameras = read_cameras_text(path)
     if len(cameras) > 1:
         raise InputError(
-            f"{path}: {len(cameras)} cameras, with ids {', '.join(map(str, cameras))}; expected exactly one: keep the "
-            "line of the camera that took these images"
+            path,
+            f"{len(cameras)} cameras, with ids {', '.join(map(str, cameras))}",
+            "expected exactly one: keep the line of the camera that took these images",
         )
     return next(iter(cameras.values()))
 
@@ -53,20 +55,21 @@ def read_intrinsics(path: Path, size: tuple[int, int] | None) -> Pinhole:
     words = read_text(path, f"expected {expected}").translate(str.maketrans(",;[]", "    "))
     numbers = to_numbers([w for line in rows(words) for w in line], str(path), expected)
     if len(numbers) not in (9, 16):
-        raise InputError(f"{path}: {len(numbers)} numbers; expected {expected}")
+        raise InputError(path, f"{len(numbers)} numbers", f"expected {expected}")
     side = 3 if len(numbers) == 9 else 4
     matrix = np.array(numbers).reshape(side, side)
     (fx, skew, cx), (zero, fy, cy) = matrix[:2, :3]
     if not np.array_equal(matrix, _intrinsics(fx, fy, cx, cy, skew, side)) or zero:
         hint = "; it looks transposed" if not matrix[0, 2] and matrix[2, 0] else ""
-        raise InputError(f"{path}: not a camera matrix{hint}; expected {expected}")
+        raise InputError(path, f"not a camera matrix{hint}", f"expected {expected}")
     if abs(skew) > 1e-9:
-        raise InputError(f"{path}: skew {skew:g} in the first row; expected 0, no camera model here has one")
+        raise InputError(path, f"skew {skew:g} in the first row", "expected 0, no camera model here has one")
     if size is None:
         raise InputError(
-            f"{path}: holds no image size; give it (read_camera(path, size=(width, height))), or write a camera.json: "
-            f'{{"model": "PINHOLE", "width": W, "height": H, "params": [{fx:g}, {fy:g}, {cx:g}, {cy:g}], '
-            '"pixel_center": 0.0}'
+            path,
+            "holds no image size",
+            'give it (read_camera(path, size=(width, height))), or write a camera.json: {"model": "PINHOLE", '
+            f'"width": W, "height": H, "params": [{fx:g}, {fy:g}, {cx:g}, {cy:g}], "pixel_center": 0.0}}',
         )
     camera = camera_from_params("PINHOLE", *size, [fx, fy, cx, cy], str(path)).with_pixel_center(0.0)
     assert isinstance(camera, Pinhole)

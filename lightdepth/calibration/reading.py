@@ -65,7 +65,7 @@ def read_camera(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
         return _plausible(read_ocamcalib(path), path)
     if lines and re.match(r"[-+\d.\[]", lines[0][0]):
         return _plausible(read_intrinsics(path, size), path)
-    raise InputError(f"{path}: not a camera calibration that is known; expected {CAMERA_FORMATS}")
+    raise InputError(path, "not a camera calibration that is known", f"expected {CAMERA_FORMATS}")
 
 
 def write_camera(camera: CameraModel, path: Path, format: str | None = None) -> None:
@@ -82,7 +82,7 @@ def write_camera(camera: CameraModel, path: Path, format: str | None = None) -> 
     if format not in _WRITERS:
         found = f"format {format!r} is not known" if format else f"no camera format ends in {suffix!r}"
         known = ", ".join(_WRITERS if format else _SUFFIXES)
-        raise InputError(f"{path}: {found}; expected one of {known}")
+        raise InputError(path, found, f"expected one of {known}")
     _WRITERS[format](camera, Path(path))
 
 
@@ -118,11 +118,13 @@ def _plausible(camera: CameraModel, path: Path) -> CameraModel:
     def off(w: int, h: int) -> float:
         return max(abs(x / w - 0.5), abs(y / h - 0.5))
 
-    found = f"{path}: principal point ({x:.1f}, {y:.1f}) in an image {width} wide and {height} high"
+    found = f"principal point ({x:.1f}, {y:.1f}) in an image {width} wide and {height} high"
     if off(height, width) < 0.06 and off(width, height) > 0.1:
         raise InputError(
-            f"{found}: width and height (or row and column) look swapped; the point is the middle of {height}x{width}"
+            path,
+            f"{found}: width and height (or row and column) look swapped",
+            f"the point is the middle of {height}x{width}",
         )
     if not (0 <= x <= width and 0 <= y <= height):
-        raise InputError(f"{found} lies outside it; is the calibration for another image size?")
+        raise InputError(path, f"{found} lies outside it", "is the calibration for another image size?")
     return camera

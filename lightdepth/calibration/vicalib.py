@@ -40,9 +40,9 @@ def read_vicalib(path: Path) -> CameraModel:
     model = _only(root, "camera_model", path)
     kind = model.get("type", "")
     if kind == "gamma":
-        raise InputError(f"{path}: a photometric calibration (type gamma); expected a geometric one. This is --light's")
+        raise InputError(path, "a photometric calibration (type gamma)", "expected a geometric one. This is --light's")
     if kind not in _COUNTS:
-        raise InputError(f"{path}: camera_model type {kind!r} is not known; expected one of {', '.join(_COUNTS)}")
+        raise InputError(path, f"camera_model type {kind!r} is not known", f"expected one of {', '.join(_COUNTS)}")
     width, height = (_whole(model, tag, path) for tag in ("width", "height"))
     params = _numbers(model, "params", path, _COUNTS[kind])
     if kind == _POLY2:
@@ -76,18 +76,19 @@ def read_photometric(path: Path) -> PhotometricCalibration:
     """Light and response of EndoMapper's photometric calibration. Metres become millimetres."""
     root = _root(path)
     if root.find(".//light_model") is None and root.find(".//params") is not None:
-        raise InputError(f"{path}: a geometric calibration; expected a photometric one. This is --camera's")
+        raise InputError(path, "a geometric calibration", "expected a photometric one. This is --camera's")
     light = _only(root, "light_model", path)
     if light.get("type", "sls") != "sls":
-        raise InputError(f"{path}: light_model type {light.get('type')!r} is not known; expected sls, one spot light")
+        raise InputError(path, f"light_model type {light.get('type')!r} is not known", "expected sls, one spot light")
     (gamma,) = _numbers(root, "gamma", path, 1)
     (mu,) = _numbers(light, "mu", path, 1)
     position, direction = (_numbers(light, tag, path, 3) for tag in "PD")
     distance = float(np.linalg.norm(position))
     if distance > _FARTHEST_LIGHT_M:
         raise InputError(
-            f"{path}: P is {distance:g} from the lens; expected metres, below {_FARTHEST_LIGHT_M:g}. This looks like "
-            "millimetres: divide it by 1000"
+            path,
+            f"P is {distance:g} from the lens",
+            f"expected metres, below {_FARTHEST_LIGHT_M:g}. This looks like millimetres: divide it by 1000",
         )
     if light.find("sigma") is not None:
         (sigma,) = _numbers(light, "sigma", path, 1)
@@ -104,7 +105,7 @@ def read_photometric(path: Path) -> PhotometricCalibration:
             source="measured",
         )
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise error.within(path) from error
 
 
 def write_photometric(light: PhotometricCalibration, path: Path) -> None:
@@ -129,11 +130,11 @@ def _root(path: Path) -> Element:
     try:
         root = defusedxml.ElementTree.fromstring(text, forbid_dtd=True)
     except DefusedXmlException as error:
-        raise InputError(f"{path}: has a DTD or entities, which are refused; expected plain XML") from error
+        raise InputError(path, "has a DTD or entities, which are refused", "expected plain XML") from error
     except SyntaxError as error:
-        raise InputError(f"{path}: not valid XML ({error})") from error
+        raise InputError(path, f"not valid XML ({error})", "correct it there") from error
     if root.tag == "opencv_storage":
-        raise InputError(f"{path}: OpenCV's XML; expected vicalib's. Save it as .yaml, which is read")
+        raise InputError(path, "OpenCV's XML", "expected vicalib's. Save it as .yaml, which is read")
     result: Element = root
     return result
 
@@ -141,7 +142,7 @@ def _root(path: Path) -> Element:
 def _only(root: Element, tag: str, path: Path) -> Element:
     found = list(root.iter(tag))
     if len(found) != 1:
-        raise InputError(f"{path}: {len(found) or 'no'} elements {tag}; expected one, in <rig>")
+        raise InputError(path, f"{len(found) or 'no'} elements {tag}", "expected one, in <rig>")
     return found[0]
 
 
@@ -150,16 +151,16 @@ def _numbers(parent: Element, tag: str, path: Path, count: int) -> list[float]:
     found = parent.find(f".//{tag}")
     where, expected = f"{path}: {tag}", f"{count} number{'s' * (count > 1)}"
     if found is None:
-        raise InputError(f"{where} missing; expected {expected}")
+        raise InputError(where, "missing", f"expected {expected}")
     words = (found.text or "").translate(str.maketrans("[];,", "    ")).split()
     numbers = to_numbers(words, where, expected)
     if len(numbers) != count:
-        raise InputError(f"{where}: {len(numbers)} numbers; expected {expected}")
+        raise InputError(where, f"{len(numbers)} numbers", f"expected {expected}")
     return numbers
 
 
 def _whole(parent: Element, tag: str, path: Path) -> int:
     (value,) = _numbers(parent, tag, path, 1)
     if value != int(value):
-        raise InputError(f"{path}: {tag} {value:g}; expected whole pixels")
+        raise InputError(path, f"{tag} {value:g}", "expected whole pixels")
     return int(value)

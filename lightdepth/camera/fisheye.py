@@ -93,9 +93,11 @@ class Scaramuzza(CameraModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.a0 <= 0:
-            raise InputError(f"SCARAMUZZA camera: a0 = {self.a0}; expected positive pixels (z into the scene)")
+            raise InputError("SCARAMUZZA camera", f"a0 = {self.a0}", "expected positive pixels (z into the scene)")
         if abs(self.c - self.d * self.e) < 1e-9:
-            raise InputError("SCARAMUZZA camera: the stretch [[c, d], [e, 1]] is singular")
+            raise InputError(
+                "SCARAMUZZA camera", "the stretch [[c, d], [e, 1]] is singular", "expected c about 1, d and e about 0"
+            )
 
     @property
     def focal_length(self) -> float:

@@ -27,10 +27,10 @@ class CameraModel(ABC):
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
-            raise InputError(f"camera size {self.width}x{self.height}; expected positive numbers of pixels")
+            raise InputError("camera size", f"{self.width}x{self.height}", "expected positive numbers of pixels")
         bad = [f.name for f in fields(self) if not np.isfinite(getattr(self, f.name))]
         if bad:
-            raise InputError(f"{self.name} camera: {', '.join(bad)} not finite")
+            raise InputError(f"{self.name} camera", f"{', '.join(bad)} not finite", "expected numbers")
 
     @abstractmethod
     def _pixels(self, points: Array) -> tuple[Array, Array]:
@@ -103,7 +103,7 @@ class FocalCamera(CameraModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.fx <= 0 or self.fy <= 0:
-            raise InputError(f"{self.name} camera: focal lengths {self.fx}, {self.fy}; expected positive pixels")
+            raise InputError(f"{self.name} camera", f"focal lengths {self.fx}, {self.fy}", "expected positive pixels")
 
     @property
     def focal_length(self) -> float:

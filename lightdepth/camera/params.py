@@ -42,11 +42,11 @@ def camera_from_params(model: str, width: int, height: int, params: list[float],
         count, build = len(fields(cls)) - 2, cls
     else:
         known = ", ".join([*CAMERA_MODELS, *_COLMAP_SPECIAL])
-        raise InputError(f"{where}: unknown camera model {model!r}; expected one of {known}")
+        raise InputError(where, f"unknown camera model {model!r}", f"expected one of {known}")
     if len(params) != count:
-        names = f"; expected {' '.join(f.name for f in fields(cls)[2:])}" if model in CAMERA_MODELS else ""
-        raise InputError(f"{where}: {model} has {count} parameters, found {len(params)}{names}")
+        names = f": {' '.join(f.name for f in fields(cls)[2:])}" if model in CAMERA_MODELS else ""
+        raise InputError(where, f"{len(params)} parameters of {model}", f"expected {count}{names}")
     try:
         return build(int(width), int(height), *map(float, params))
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise error.within(where) from error

@@ -27,8 +27,9 @@ def own_packages_first(home: Path = Path(__file__).resolve().parents[2]) -> None
         spec = getattr(sys.modules.get(name), "__spec__", None)
         if spec is not None and _is_foreign(spec, name, home):
             raise InputError(
-                f"{spec.origin}: loaded under the name {name!r}, which lightdepth's own package has; "
-                "run lightdepth in a process of its own, or rename that file"
+                spec.origin,
+                f"loaded under the name {name!r}, which lightdepth's own package has",
+                "run lightdepth in a process of its own, or rename that file",
             )
     foreign = [entry for entry in sys.path if any(_is_foreign(_found(name, entry), name, home) for name in NAMES)]
     if foreign:

@@ -42,10 +42,14 @@ def calibrate_light(
     """
     page_path = output.with_suffix(".html")
     if output.is_dir() or output.suffix == ".html":
-        raise InputError(f"-o {output}: expected the name of a file to write, such as light.json")
+        raise InputError(
+            "-o",
+            f"{output} is a folder, or named as what is written beside it",
+            "expected the name of a file to write, such as light.json",
+        )
     made = [path for path in (output, page_path) if path.exists()]
     if made and not overwrite:
-        raise InputError(f"{made[0]}: already there; choose another -o, or give --overwrite")
+        raise InputError(made[0], "already there", "choose another -o, or give --overwrite")
     rng = np.random.default_rng(seed)
     source = SequenceSource(data, format, camera, mask=mask)
     if map is None:

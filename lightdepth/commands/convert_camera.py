@@ -34,12 +34,14 @@ def convert_camera(
         overwrite: Replace a file made before.
     """
     if output.exists() and not overwrite:
-        raise InputError(f"{output}: already there; choose another -o, or give --overwrite")
+        raise InputError(output, "already there", "choose another -o, or give --overwrite")
     camera = read_camera(file, size)
     if size is not None and size != (camera.width, camera.height):
         if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > 0.01:
             raise InputError(
-                f"--size {size[0]} {size[1]}: {file} is for {camera.width}x{camera.height}; expected the same aspect"
+                f"--size {size[0]} {size[1]}",
+                f"{file} is for {camera.width}x{camera.height}",
+                "expected the same aspect",
             )
         camera = camera.resized(*size)
     said = f"{camera.name}, as it was read"
@@ -47,7 +49,7 @@ def convert_camera(
         counted = read_mask(mask) if mask is not None else None
         if counted is not None and counted.shape != (camera.height, camera.width):
             raise InputError(
-                f"{mask}: {counted.shape[1]}x{counted.shape[0]} pixels; expected {camera.width}x{camera.height}"
+                f"{mask}", f"{counted.shape[1]}x{counted.shape[0]} pixels", f"expected {camera.width}x{camera.height}"
             )
         found = camera_conversion.convert_camera(camera, model, counted)
         said = (

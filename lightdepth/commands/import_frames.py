@@ -79,7 +79,11 @@ def import_frames(
         pictures: list[Picture] = []
         if frames:
             if not len(chosen):
-                raise InputError(f"{source.data}: no frame to keep; " + " ".join(f"{f.found} {f.cure}" for f in found))
+                raise InputError(
+                    source.data,
+                    "no frame to keep",
+                    " ".join(f"{f.found} {f.cure}" for f in found) or "look at the frames",
+                )
             pictures = write_pictures(run, opened, scan, fate, regions, geometry, shape.deinterlace)
         known = facts(opened, scan, fate, regions, geometry, choice, source.data if keep_names else None)
         axis = (scan.times, "time [s]") if np.isfinite(scan.times).all() else (scan.rows, "frame")

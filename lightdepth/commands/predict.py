@@ -55,5 +55,5 @@ def predict(
                 (run.folder / "previews" / f"{frame.name}.png").write_bytes(png(picture))
             bar.advance()
         if len(run.record["failures"]) == len(frames):
-            raise InputError(f"{source.data}: no frame could be read; the first: {run.record['failures'][0]['reason']}")
+            raise InputError(source.data, "no frame could be read", f"the first: {run.record['failures'][0]['reason']}")
         run.record["checkpoint"] = model.name

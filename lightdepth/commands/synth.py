@@ -44,13 +44,15 @@ class ColonConfig:
 
     def __post_init__(self) -> None:
         if self.frames < 1:
-            raise InputError(f"--frames {self.frames}; expected at least 1")
+            raise InputError("--frames", f"{self.frames}", "expected at least 1")
 
     def rendered(self, scene: TubeConfig, progress: Callable[[int, int], None]) -> TubeSequence:
         """The frames. Raises InputError where `scene` has ranges of its own and the family has others."""
         if self.family == "realistic":
             if scene != TubeConfig():
-                raise InputError("--family realistic has ranges of its own; leave out --scene, or take --family plain")
+                raise InputError(
+                    "--family realistic", "it has ranges of its own", "leave out --scene, or take --family plain"
+                )
             scene = realistic()
         chosen = read_light(self.light) if self.light is not None else None
         camera = tube_lens(self.lens, *self.size)
@@ -83,9 +85,9 @@ def synth(
     arguments = recorded(colon, output=output, layout=layout, spurious=spurious, scene=scene, slam=slam)
     slam = slam if spurious is None else replace(slam, spurious=spurious)
     if not 0 <= slam.spurious < 1:
-        raise InputError(f"--spurious {slam.spurious}; expected a share of at least 0 and below 1")
+        raise InputError("--spurious", f"{slam.spurious}", "expected a share of at least 0 and below 1")
     if layout == "endomapper" and colon.lens == "c3vd":
-        raise InputError("--layout endomapper holds no Scaramuzza lens, as C3VD's is; add --lens fisheye")
+        raise InputError("--layout endomapper", "it holds no Scaramuzza lens, as C3VD's is", "add --lens fisheye")
     with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", colon.frames) as bar:
         made = colon.rendered(scene, lambda *_: bar.advance()).frames
         if layout == "endomapper":  # which counts frames from 1

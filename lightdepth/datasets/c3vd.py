@@ -104,8 +104,9 @@ def read_c3vd(
     tree = _tree(path)
     if tree is None:
         raise InputError(
-            f"{path}: no *_color.png in it or in color/, and no rgb/NNNN.png beside depth/ or pose.txt; "
-            "is it a C3VD sequence?"
+            path,
+            "no *_color.png in it or in color/, and no rgb/NNNN.png beside depth/ or pose.txt",
+            "is it a C3VD sequence?",
         )
     colour = _colour(path, tree)
     depth = numbered_files(path / tree.depth, r"(\d+)_depth\.tiff")
@@ -114,16 +115,19 @@ def read_c3vd(
     poses = _read_poses(path / "pose.txt") if (path / "pose.txt").is_file() else None
     if poses is not None and numbers[-1] >= len(poses):
         raise InputError(
-            f"{path / 'pose.txt'}: {len(poses)} poses, but there is a frame {numbers[-1]}; expected a line for each "
-            "frame, from frame 0"
+            f"{path / 'pose.txt'}",
+            f"{len(poses)} poses, but there is a frame {numbers[-1]}",
+            "expected a line for each frame, from frame 0",
         )
     if camera is None:
         height, width = read_image(images[0]).shape[:2]
         whole = tree.camera
         if abs(width / height / (whole.width / whole.height) - 1) > 0.01:
             raise InputError(
-                f"{path}: images are {width}x{height}; C3VD's camera is for {whole.width}x{whole.height} and its "
-                "reductions. Give the camera of cropped images with --camera FILE"
+                path,
+                f"images are {width}x{height}",
+                f"C3VD's camera is for {whole.width}x{whole.height} and its reductions. Give the camera of cropped "
+                "images with --camera FILE",
             )
         camera = whole.resized(width, height)
     if mask is None:
@@ -182,9 +186,11 @@ def _read_poses(path: Path) -> np.ndarray:
     try:
         rows = np.loadtxt(path, delimiter=",", ndmin=2)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a C3VD pose file, 16 numbers a line separated by commas ({error})") from error
+        raise InputError(
+            path, f"not a C3VD pose file ({error})", "expected 16 numbers a line separated by commas"
+        ) from error
     if rows.shape[1] != 16:
-        raise InputError(f"{path}: {rows.shape[1]} numbers a line; expected 16, a camera-to-world matrix")
+        raise InputError(path, f"{rows.shape[1]} numbers a line", "expected 16, a camera-to-world matrix")
     matrices = rows.reshape(-1, 4, 4)
     last = np.array([0, 0, 0, 1.0])
     if np.allclose(matrices[:, 3], last, atol=1e-4):
@@ -192,7 +198,11 @@ def _read_poses(path: Path) -> np.ndarray:
     elif np.allclose(matrices[:, :, 3], last, atol=1e-4):
         poses = matrices.transpose(0, 2, 1)
     else:
-        raise InputError(f"{path}: neither the last row nor the last column of the poses is 0 0 0 1")
+        raise InputError(
+            path,
+            "neither the last row nor the last column of the poses is 0 0 0 1",
+            "expected a rotation and a translation a line",
+        )
     for i, pose in enumerate(poses):
         check_rigid(pose, f"{path}: line {i + 1}")
     return poses

@@ -29,10 +29,10 @@ _Schema = TypeVar("_Schema", bound=BaseModel)
 
 
 def inside(name: str) -> str:
-    """The name of a folder below the data's root, or ValueError when it leads anywhere else."""
+    """The name of a folder below the data's root, or InputError when it leads anywhere else."""
     parts = name.replace("\\", "/").split("/")
     if not name.strip() or name.startswith(("/", "~")) or ".." in parts or ":" in parts[0]:
-        raise ValueError(f"{name!r} leads outside the data's root; expected the name of a folder below it")
+        raise InputError(repr(name), "leads outside the data's root", "expected the name of a folder below it")
     return "/".join(part for part in parts if part not in ("", "."))
 
 
@@ -81,11 +81,13 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     try:
         data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+        raise InputError(
+            path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
+        ) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())[:200]})") from error
+        raise InputError(path, f"not valid YAML ({' '.join(str(error).split())[:200]})", "correct it there") from error
     if not isinstance(data, dict):
-        raise InputError(f"{path}: no keys in it; expected {', '.join(schema.model_fields)}")
+        raise InputError(path, "no keys in it", f"expected {', '.join(schema.model_fields)}")
     return checked_fields(schema, data, str(path))
 
 

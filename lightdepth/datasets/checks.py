@@ -60,8 +60,10 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
     fit = fitting_reading(frames)
     if fit is not None and fit.best != AS_GIVEN:
         raise InputError(
-            f"{sequence.source}: poses and true distances contradict each other: distances seen from two frames differ "
-            f"by {fit.error_as_given:.1%} (median). They agree to {fit.error:.1%} {fit.best}"
+            sequence.source,
+            "poses and true distances contradict each other: distances seen from two frames differ by "
+            f"{fit.error_as_given:.1%} (median)",
+            f"they agree to {fit.error:.1%} {fit.best}",
         )
     return sequence
 

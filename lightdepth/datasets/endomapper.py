@@ -82,11 +82,12 @@ def read_endomapper(
             height, width = read_image(images[0]).shape[:2]
             camera = at_size(own, width, height, images[0].name)
     if not images:
-        raise InputError(f"{image_folder(path)}: {no_images(image_folder(path))}; expected out1.png, out2.png")
+        raise InputError(f"{image_folder(path)}", f"{no_images(image_folder(path))}", "expected out1.png, out2.png")
     if frame_number(images[0].name) < 1:
         raise InputError(
-            f"{images[0]}: number 0, but EndoMapper counts frames from 1 (out1.png is the first of the video); "
-            "extract them so, or read them with --format folder"
+            images[0],
+            "number 0, but EndoMapper counts frames from 1 (out1.png is the first of the video)",
+            "extract them so, or read them with --format folder",
         )
     numbers = checked_images(path, images)
     height, width = read_image(images[0]).shape[:2]
@@ -94,8 +95,9 @@ def read_endomapper(
         file = calibration_file(path, GEOMETRY)
         if file is None:
             raise InputError(
-                f"{path}: no Endoscope_XX_{GEOMETRY}.xml here, nor in Calibrations/ here or above; put it beside the "
-                "frames, or give --camera FILE"
+                path,
+                f"no Endoscope_XX_{GEOMETRY}.xml here, nor in Calibrations/ here or above",
+                "put it beside the frames, or give --camera FILE",
             )
         camera = at_size(read_camera(file), width, height, images[0].name)
     if light is None:
@@ -119,10 +121,14 @@ def write_endomapper(frames: Sequence[Frame], path: Path, endoscope: str = "00")
     """img_train/out<N>.png by the frames' numbers, which count from 1, the two XML files and mask.png. Truth, gain and
     reflectance have no place in it."""
     if not len(frames):
-        raise InputError(f"{path}: no frames to write")
+        raise InputError(path, "no frames to write", "expected at least one")
     early = [frame.name for frame in frames if frame.number < 1]
     if early:
-        raise InputError(f"{path}: frame {early[0]} has number {frame_number(early[0])}; EndoMapper counts from 1")
+        raise InputError(
+            path,
+            f"frame {early[0]} has number {frame_number(early[0])}",
+            "expected at least 1: EndoMapper counts from 1",
+        )
     (path / "img_train").mkdir(parents=True)
     write_camera(frames[0].camera, path / f"Endoscope_{endoscope}_{GEOMETRY}.xml")
     write_light(frames[0].light, path / f"Endoscope_{endoscope}_{PHOTOMETRY}.xml")
@@ -143,7 +149,7 @@ def _in_cluster(path: Path, images: list[Path]) -> tuple[list[Path], CameraModel
         odd = [name for name in names if not re.fullmatch(r"(?:.*[/\\])?out\d+(?:\.\w+)?", name)]
         if odd or not names:
             raise InputError(
-                f"{path}: {odd[0][:60] if odd else 'nothing in it'}; expected the frames' names, out<N>.png"
+                path, f"{odd[0][:60] if odd else 'nothing in it'}", "expected the frames' names, out<N>.png"
             )
         numbers = {frame_number(name) for name in names}
     else:
@@ -151,7 +157,9 @@ def _in_cluster(path: Path, images: list[Path]) -> tuple[list[Path], CameraModel
     missing = sorted(numbers - {frame_number(image.name) for image in images})
     if missing:
         raise InputError(
-            f"{path}: {len(missing)} of its {len(numbers)} frames are not there, the first is out{missing[0]}"
+            path,
+            f"{len(missing)} of its {len(numbers)} frames are not there, the first is out{missing[0]}",
+            "add them, or take them out of the list",
         )
     chosen = [image for image in images if frame_number(image.name) in numbers]
     return chosen, keyframes[0].camera if keyframes else None
@@ -201,16 +209,19 @@ def calibration_file(path: Path, kind: str) -> Path | None:
             return next(iter(found.values()))
         if number is None:
             raise InputError(
-                f"{folder}: {len(found)} calibrations ({', '.join(found)}) and no Seq_NNN_info.json that says which "
-                "endoscope it was; put the right one beside the frames, or give --camera and --light"
+                folder,
+                f"{len(found)} calibrations ({', '.join(found)}) and no Seq_NNN_info.json that says which endoscope "
+                "it was",
+                "put the right one beside the frames, or give --camera and --light",
             )
         for name, file in found.items():
             label = name.removeprefix("Endoscope_").removesuffix(f"_{kind}.xml")
             if label == number or (label.isdigit() and number.isdigit() and int(label) == int(number)):
                 return file
         raise InputError(
-            f"{folder}: {', '.join(found)}, but the sequence was made with endoscope {number}; give its calibration "
-            "with --camera and --light"
+            folder,
+            f"{', '.join(found)}, but the sequence was made with endoscope {number}",
+            "give its calibration with --camera and --light",
         )
     return None
 
@@ -222,7 +233,7 @@ def _endoscope(path: Path) -> str | None:
             data = read_json(file)
             number = data.get("endoscope_number") if isinstance(data, dict) else None
             if number is None:
-                raise InputError(f"{file}: endoscope_number missing; expected the number of the endoscope, or N/A")
+                raise InputError(file, "endoscope_number missing", "expected the number of the endoscope, or N/A")
             return str(number)
     return None
 

@@ -72,15 +72,16 @@ def read_endoslam(
     folder = image_folder(path)
     images = [folder / name for name in _rendered(path).values()] or (list_images(folder) if folder.is_dir() else [])
     if not images:
-        raise InputError(f"{path}: no Frames/ with images in it, and no image_NNNN.png; is it a sequence of EndoSLAM?")
+        raise InputError(path, "no Frames/ with images in it, and no image_NNNN.png", "is it a sequence of EndoSLAM?")
     height, width = read_image(images[0]).shape[:2]
     if camera is None:
         file = camera_file(path)
         if file is None:
             raise InputError(
-                f"{path}: no camera. EndoSLAM's are MATLAB files (.mat), which are not read: write the numbers into a "
-                'camera.json ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}) and give it '
-                "with --camera"
+                path,
+                "no camera: EndoSLAM's are MATLAB files (.mat), which are not read",
+                'write the numbers into a camera.json ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, '
+                "fy, cx, cy]}) and give it with --camera",
             )
         camera = _read_calibration(file) if _simulated(path) else read_camera(file, (width, height))
     poses = _poses(path)
@@ -103,10 +104,12 @@ def write_endoslam(frames: Sequence[Frame], path: Path, simulated: bool = False)
     """Frames of a pinhole as UnityCam's sequences are shipped (`.../UnityCam/Colon`), or as EndoMapper's simulated
     ones, with poses where they have them; numbered from 0 without a gap. Depth is not written."""
     if [frame.number for frame in frames] != list(range(len(frames))) or not len(frames):
-        raise InputError(f"{path}: the frames are not numbered 0, 1, 2, ...; poses are told apart by line")
+        raise InputError(
+            path, "the frames are not numbered 0, 1, 2, ...", "number them so: poses are told apart by line"
+        )
     camera = frames[0].camera
     if not isinstance(camera, Pinhole):
-        raise InputError(f"{path}: a {camera.name} camera; the files hold a PINHOLE alone")
+        raise InputError(path, f"a {camera.name} camera", "convert it: the files hold a PINHOLE alone")
     folder, poses = (path, path) if simulated else (path / "Frames", path / "Poses")
     for made in (folder, poses):
         made.mkdir(parents=True, exist_ok=True)
@@ -150,12 +153,12 @@ def _read_calibration(path: Path) -> CameraModel:
         try:
             found[key.strip()] = float(value) if colon else 0.0
         except ValueError as error:
-            raise InputError(f"{path}: {key.strip()} is {value.strip()!r}; expected a number") from error
+            raise InputError(path, f"{key.strip()} is {value.strip()!r}", "expected a number") from error
     names = ("cols", "rows", "fx", "fy", "cx", "cy")
     missing = [name for name in names if name not in found]
     if missing:
         raise InputError(
-            f"{path}: {', '.join(missing)} missing; expected lines such as `fx: 400`, of {', '.join(names)}"
+            path, f"{', '.join(missing)} missing", f"expected lines such as `fx: 400`, of {', '.join(names)}"
         )
     width, height, *params = (found[name] for name in names)
     return camera_from_params("PINHOLE", int(width), int(height), params, str(path))
@@ -169,12 +172,12 @@ def _poses(path: Path) -> dict[int, np.ndarray]:
         if not file.is_file():
             return {}
         if not info.is_file() or "dm" not in info.read_text(errors="replace").lower().split():
-            raise InputError(f"{info}: does not say that lengths are in dm; restore it, or remove {file.name}")
+            raise InputError(info, "does not say that lengths are in dm", f"restore it, or remove {file.name}")
     else:
         files = sorted((path / "Poses").glob("*.csv")) if _rendered(path) else []
         if len(files) > 1:
             raise InputError(
-                f"{path / 'Poses'}: {', '.join(f.name for f in files)}; leave the sequence's own alone there"
+                f"{path / 'Poses'}", f"{', '.join(f.name for f in files)}", "leave the sequence's own alone there"
             )
         if not files:
             return {}
@@ -195,9 +198,10 @@ def _read_csv(path: Path, mm: float) -> dict[int, np.ndarray]:
         names = [name.strip().lower() for name in header.split(between)]
         if not set(_COLUMNS) <= set(names):
             raise InputError(
-                f"{path}: the first line is {header.strip()[:60]!r}; expected a header that names tX tY tZ (position) "
-                "and rX rY rZ rW (quaternion). The order of columns differs from file to file: write the header, or "
-                "move the file away to read the frames without poses"
+                path,
+                f"the first line is {header.strip()[:60]!r}",
+                "expected a header that names tX tY tZ (position) and rX rY rZ rW (quaternion). The order of columns "
+                "differs from file to file: write the header, or move the file away to read the frames without poses",
             )
         rows = [row for row in csv.reader(stream, delimiter=between) if row]
     poses = {}
@@ -207,10 +211,10 @@ def _read_csv(path: Path, mm: float) -> dict[int, np.ndarray]:
         except (ValueError, IndexError) as error:
             if number == len(rows) - 1 and number:
                 break  # a last line that was cut off: that frame has no pose
-            raise InputError(f"{path}: line {number + 2} is {between.join(row)[:60]!r}; expected numbers") from error
+            raise InputError(path, f"line {number + 2} is {between.join(row)[:60]!r}", "expected numbers") from error
         length = float(np.linalg.norm(values[3:]))
         if not np.isfinite(values).all() or abs(length - 1) > 1e-2:
-            raise InputError(f"{path}: line {number + 2}: a quaternion of length {length:.4g}, or NaN; expected 1")
+            raise InputError(path, f"line {number + 2}: a quaternion of length {length:.4g}, or NaN", "expected 1")
         unity = np.eye(4)
         unity[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
         unity[:3, 3] = np.multiply(values[:3], mm)

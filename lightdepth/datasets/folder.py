@@ -45,7 +45,7 @@ def read_folder(
     """Frames of a folder. What is given here wins over the files in it; without any camera it is refused."""
     images = list_images(image_folder(path))
     if not images:
-        raise InputError(f"{path}: {no_images(path)}; expected frames such as 000123.png")
+        raise InputError(path, f"{no_images(path)}", "expected frames such as 000123.png")
     known = {frame_number(file.name) for file in (path / "truth" / "distance").glob("*.tiff")}
     checked_images(path, images, known)
     first = legible(images)
@@ -53,10 +53,12 @@ def read_folder(
         if not _has_camera(path):
             above = path.resolve().parent
             if (above / "camera.json").is_file():
-                raise InputError(f"{path}: no camera.json, but {above} has one; give the sequence's folder, {above}")
+                raise InputError(path, f"no camera.json, but {above} has one", f"give the sequence's folder, {above}")
             raise InputError(
-                f"{path}: no camera.json; give --camera FILE "
-                '({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), or a map that has one'
+                path,
+                "no camera.json",
+                'give --camera FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), or '
+                "a map that has one",
             )
         camera = read_camera(path / "camera.json")
         if first is not None:
@@ -68,7 +70,9 @@ def read_folder(
     truth = path / "truth"
     times, poses = read_tum(truth / "poses.tum") if (truth / "poses.tum").is_file() else (None, None)
     if poses is not None and len(poses) != len(images):
-        raise InputError(f"{truth / 'poses.tum'}: {len(poses)} poses for {len(images)} frames; expected one for each")
+        raise InputError(
+            f"{truth / 'poses.tum'}", f"{len(poses)} poses for {len(images)} frames", "expected one for each"
+        )
     clock = read_times(path / "times.csv") if (path / "times.csv").is_file() else {}
     of_truth = [None if times is None else float(times[i]) for i in range(len(images))]
 
@@ -115,7 +119,7 @@ def write_folder(frames: Iterable[Frame], path: Path) -> None:
             poses.append(frame.true_world_from_cam)
             times.append(frame.time or 0.0)
     if first is None:
-        raise InputError(f"{path}: no frames to write")
+        raise InputError(path, "no frames to write", "expected at least one")
     write_camera(first.camera, path / "camera.json")
     write_light(first.light, path / "light.json")
     if first.mask is not None:
@@ -135,7 +139,7 @@ def read_times(path: Path) -> dict[str, float]:
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as times of frames ({error})") from error
+        raise InputError(path, f"cannot be read as times of frames ({error})", "expected lines NAME,seconds") from error
     for row, line in enumerate(lines[1:], 2):
         name, _, seconds = line.partition(",")
         try:
@@ -143,5 +147,5 @@ def read_times(path: Path) -> dict[str, float]:
         except ValueError:
             times[name] = float("nan")
         if not np.isfinite(times[name]):
-            raise InputError(f"{path}: line {row}: {line!r}; expected NAME,seconds")
+            raise InputError(path, f"line {row}: {line!r}", "expected NAME,seconds")
     return times

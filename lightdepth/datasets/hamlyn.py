@@ -66,8 +66,9 @@ def read_hamlyn(
     tree = _tree(path)
     if tree is None:
         raise InputError(
-            f"{path}: neither image01/ and depth01/ nor color/ and depth/, with images named by a number; is it a "
-            "sequence of Endo-Depth's Hamlyn set?"
+            path,
+            "neither image01/ and depth01/ nor color/ and depth/, with images named by a number",
+            "is it a sequence of Endo-Depth's Hamlyn set?",
         )
     colour, depth = numbered_files(path / tree.colour, _COLOUR), numbered_files(path / tree.depth, _DEPTH)
     images = [colour[n] for n in sorted(colour)]
@@ -75,7 +76,7 @@ def read_hamlyn(
     if camera is None:
         file = camera_file(path)
         if not file.is_file():
-            raise InputError(f"{path}: no intrinsics.txt; put the sequence's there, or give --camera FILE")
+            raise InputError(path, "no intrinsics.txt", "put the sequence's there, or give --camera FILE")
         height, width = read_image(images[0]).shape[:2]
         camera = read_camera(file, (width, height))
     if mask is None:
@@ -96,10 +97,10 @@ FORMAT = Format(
 def write_hamlyn(frames: Sequence[Frame], path: Path, tree: str = "rectified") -> None:
     """A sequence as it is shipped ("rectified" or "tracking"), of one pinhole camera, with depth rounded to 1 mm."""
     if not len(frames):
-        raise InputError(f"{path}: no frames to write")
+        raise InputError(path, "no frames to write", "expected at least one")
     camera, where = frames[0].camera, _TREES[tree]
     if not isinstance(camera, Pinhole):
-        raise InputError(f"{path}: a {camera.name} camera; intrinsics.txt holds a PINHOLE alone")
+        raise InputError(path, f"a {camera.name} camera", "convert it: intrinsics.txt holds a PINHOLE alone")
     for folder in (where.colour, where.depth):
         (path / folder).mkdir(parents=True)
     for frame in frames:

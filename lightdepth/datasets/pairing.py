@@ -21,7 +21,10 @@ def check_shared_frames(sparse_map: SparseMap, frames: FrameSequence) -> None:
         cure = "are the map's times in milliseconds?"
     else:
         cure = f'if one counts from elsewhere, put "frame_offset" into {SIDECAR}'
-    found = f"{sparse_map.source}: keyframes {mapped[0]} to {mapped[-1]}, {frames.source}: frames {first} to {last}"
+    found = f"keyframes {mapped[0]} to {mapped[-1]}, {frames.source}: frames {first} to {last}"
     if not shared:
-        raise InputError(f"{found}, and none in common. They meet by the number in their names; {cure}")
-    warnings.warn(f"{found}; {len(shared)} of {len(mapped)} keyframes have a frame; {cure}", stacklevel=2)
+        raise InputError(
+            sparse_map.source, f"{found}, and none in common", f"they meet by the number in their names: {cure}"
+        )
+    said = f"{len(shared)} of {len(mapped)} keyframes have a frame"
+    warnings.warn(f"{sparse_map.source}: {found}; {said}; {cure}", stacklevel=2)

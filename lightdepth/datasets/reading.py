@@ -46,9 +46,13 @@ def open_sequence(
             cure = _other_format(path, format) if format is not None else _folders_below(path)
         if not cure:
             raise
-        raise InputError(f"{error}{cure}") from error
+        raise InputError(error.where, error.found, f"{error.cure}{cure}") from error
     except OSError as error:
-        raise InputError(f"{error.filename or path}: cannot be read ({error.strerror or error})") from error
+        raise InputError(
+            error.filename or path,
+            f"cannot be read ({error.strerror or error})",
+            "expected files that are there and may be read",
+        ) from error
 
 
 def _open(
@@ -65,11 +69,11 @@ def _open(
         return _open_video(video, camera, light, mask, map_camera)
     if not path.is_dir() and not cluster:
         found = "is a file" if path.is_file() else "does not exist"
-        raise InputError(f"{path}: {found}; expected a folder of frames, or a video such as .mp4 or .mov")
+        raise InputError(path, found, "expected a folder of frames, or a video such as .mp4 or .mov")
     if format == "video":
-        raise InputError(f"{path}: no video in it, or images beside it; give the video file itself")
+        raise InputError(path, "no video in it, or images beside it", "give the video file itself")
     if format is not None and format not in _BY_NAME:
-        raise InputError(f"format {format!r}; expected one of {', '.join(FORMATS)}")
+        raise InputError("format", f"{format!r} is not known", f"expected one of {', '.join(FORMATS)}")
     if cluster:
         data_set = endomapper.FORMAT
     elif format is not None:

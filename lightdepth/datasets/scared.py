@@ -78,7 +78,7 @@ def read_scared(
     The sequence of data/rgb.mp4, or where there is none the keyframe alone.
     """
     if view not in IMAGES:
-        raise InputError(f"view {view!r}; expected left or right")
+        raise InputError("view", f"{view!r} is not known", "expected left or right")
     if any(part in _BAD for part in path.resolve().parts):
         warnings.warn(
             f"{path}: the calibration of {' and '.join(_BAD)} is known to be wrong; leave them out", stacklevel=3
@@ -96,7 +96,7 @@ def _read_keyframe(
 ) -> FrameSequence:
     image, truth = path / IMAGES[view], path / f"{view}_depth_map.tiff"
     if not image.is_file():
-        raise InputError(f"{path}: neither {VIDEO} nor {image.name} in it; is it a keyframe folder of SCARED?")
+        raise InputError(path, f"neither {VIDEO} nor {image.name} in it", "is it a keyframe folder of SCARED?")
     height, width = read_image(image).shape[:2]
     if camera is None:
         camera = _camera(_read_yaml(path / "endoscope_calibration.yaml", view), width, height, path)
@@ -114,19 +114,19 @@ def _read_sequence(
     video = VideoFile(path / VIDEO)
     if video.height % 2:
         raise InputError(
-            f"{video.path}: {video.width}x{video.height}; expected the left view above the right, of one height"
+            video.path, f"{video.width}x{video.height}", "expected the left view above the right, of one height"
         )
     height, fps = video.height // 2, video.rate or 25.0
     data, points = numbered_members(path / "data", *_DATA), numbered_members(path / "data", *_POINTS)
     records = {n: (name, _json(blob, name)) for n, name, blob in data.all()} if data is not None else {}
     if camera is None and not records:
         raise InputError(
-            f"{path}: neither data/frame_data.tar.gz nor data/frame_data/; put it beside the video, or give --camera"
+            path, "neither data/frame_data.tar.gz nor data/frame_data/", "put it beside the video, or give --camera"
         )
     numbers = sorted(records) if records else list(range(len(video)))
     if numbers[-1] >= len(video):
         raise InputError(
-            f"{path}: there is frame data {numbers[-1]}, but {VIDEO} has {len(video)} frames, from 0; is it complete?"
+            path, f"there is frame data {numbers[-1]}, but {VIDEO} has {len(video)} frames, from 0", "is it complete?"
         )
     calibration = _from_json(*records[numbers[0]], view) if records else None
     if camera is None:
@@ -198,14 +198,14 @@ def _pose_readings() -> dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]
 def _from_json(where: str, record: dict[str, Any], view: str) -> _Calibration:
     found = record.get("camera-calibration")
     if not isinstance(found, dict):
-        raise InputError(f"{where}: camera-calibration missing; expected KL, DL, KR, DR, R and T")
+        raise InputError(where, "camera-calibration missing", "expected KL, DL, KR, DR, R and T")
     side = view[0].upper()
     return _calibration({k: _flat(found.get(k), f"{where}: {k}") for k in (f"K{side}", f"D{side}", "R", "T")}, where)
 
 
 def _read_yaml(path: Path, view: str) -> _Calibration:
     if not path.is_file():
-        raise InputError(f"{path}: no such file; put the keyframe's there, or give --camera FILE")
+        raise InputError(path, "no such file", "put the keyframe's there, or give --camera FILE")
     side = "1" if view == "left" else "2"
     return _calibration(read_matrices(path, (f"M{side}", f"D{side}", "R", "T")), str(path))
 
@@ -214,9 +214,9 @@ def _calibration(found: dict[str, list[float]], where: str) -> _Calibration:
     """From K, D, R, T by these first letters (M for K), in this order."""
     (matrix_name, matrix), (_, distortion), (_, rotation), (_, translation) = found.items()
     if len(matrix) != 9 or matrix[3] or matrix[6:] != [0, 0, 1] or abs(matrix[1]) > 1e-6:
-        raise InputError(f"{where}: {matrix_name} {matrix}; expected fx 0 cx / 0 fy cy / 0 0 1")
+        raise InputError(where, f"{matrix_name} {matrix}", "expected fx 0 cx / 0 fy cy / 0 0 1")
     if len(rotation) != 9 or len(translation) != 3:
-        raise InputError(f"{where}: R has {len(rotation)} numbers and T {len(translation)}; expected 9 and 3")
+        raise InputError(where, f"R has {len(rotation)} numbers and T {len(translation)}", "expected 9 and 3")
     right_from_left = np.eye(4)
     right_from_left[:3, :3] = np.reshape(rotation, (3, 3))
     right_from_left[:3, 3] = translation
@@ -237,7 +237,7 @@ def _camera(calibration: _Calibration, width: int, height: int, path: Path) -> C
     fx, _, cx, _, fy, cy, *_ = calibration.matrix
     distortion = calibration.distortion
     if len(distortion) not in (0, 4, 5):
-        raise InputError(f"{path}: {len(distortion)} distortion coefficients; expected k1 k2 p1 p2 and perhaps k3")
+        raise InputError(path, f"{len(distortion)} distortion coefficients", "expected k1 k2 p1 p2 and perhaps k3")
     if not any(distortion):
         return camera_from_params("PINHOLE", width, height, [fx, fy, cx, cy], str(path)).with_pixel_center(0.0)
     camera = camera_from_params("OPENCV", width, height, [fx, fy, cx, cy, *distortion[:4]], str(path))
@@ -246,8 +246,9 @@ def _camera(calibration: _Calibration, width: int, height: int, path: Path) -> C
         camera, off = without_k3(camera, distortion[4])
         if off > 0.5:
             raise InputError(
-                f"{path}: k3 = {distortion[4]:g} cannot be folded into k1, k2, p1, p2: {off:.2g} pixels are left. "
-                "Undistort the images, or give --camera FILE"
+                path,
+                f"k3 = {distortion[4]:g} cannot be folded into k1, k2, p1, p2: {off:.2g} pixels are left",
+                "undistort the images, or give --camera FILE",
             )
         warnings.warn(
             f"{path}: k3 = {distortion[4]:g} is folded into the other coefficients, off by {off:.2g} pixels",
@@ -259,7 +260,7 @@ def _camera(calibration: _Calibration, width: int, height: int, path: Path) -> C
 def _pose(where: str, record: dict[str, Any]) -> np.ndarray:
     pose = np.array(_flat(record.get("camera-pose"), f"{where}: camera-pose"))
     if pose.size != 16:
-        raise InputError(f"{where}: camera-pose has {pose.size} numbers; expected 4x4")
+        raise InputError(where, f"camera-pose has {pose.size} numbers", "expected 4x4")
     check_rigid(pose.reshape(4, 4), f"{where}: camera-pose")
     return pose.reshape(4, 4)
 
@@ -270,8 +271,9 @@ def _distance(points: np.ndarray, camera: CameraModel, where: Path | str, first_
     expected = (height, camera.width, 3)
     if points.dtype != np.float32 or points.shape != expected:
         raise InputError(
-            f"{where}: {points.dtype} of shape {points.shape}; expected float32 X Y Z of shape {expected}, "
-            "each pixel's point"
+            where,
+            f"{points.dtype} of shape {points.shape}",
+            f"expected float32 X Y Z of shape {expected}, each pixel's point",
         )
     depth = points[first_row : first_row + camera.height, :, 2]
     ray_z = camera.rays()[0][..., 2]
@@ -289,9 +291,9 @@ def _json(blob: bytes, where: str) -> dict[str, Any]:
     try:
         found = json.loads(blob)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{where}: not valid JSON ({error})") from error
+        raise InputError(where, f"not valid JSON ({error})", "is the archive complete?") from error
     if not isinstance(found, dict):
-        raise InputError(f"{where}: expected camera-calibration and camera-pose")
+        raise InputError(where, f"holds {type(found).__name__}", "expected camera-calibration and camera-pose")
     return found
 
 
@@ -300,7 +302,7 @@ def _flat(value: Any, where: str) -> list[float]:
     try:
         numbers = np.array(value, dtype=np.float64).ravel()
     except (TypeError, ValueError) as error:
-        raise InputError(f"{where}: {str(value)[:40]}; expected numbers") from error
+        raise InputError(where, f"{str(value)[:40]}", "expected numbers") from error
     if value is None or not np.isfinite(numbers).all():
-        raise InputError(f"{where}: {'missing' if value is None else 'NaN or infinite'}; expected finite numbers")
+        raise InputError(where, f"{'missing' if value is None else 'NaN or infinite'}", "expected finite numbers")
     return numbers.tolist()

@@ -84,9 +84,9 @@ class Archive:
         if match is None or not member.isfile():
             return None
         if int(match[1]) in self._found:
-            raise InputError(f"{self._path}: two members have the number {int(match[1])}")
+            raise InputError(self._path, f"two members have the number {int(match[1])}", "expected one for each frame")
         if member.size > _LARGEST:
-            raise InputError(f"{self._path}: {member.name} has {member.size} bytes; expected at most {_LARGEST}")
+            raise InputError(self._path, f"{member.name} has {member.size} bytes", f"expected at most {_LARGEST}")
         self._found[int(match[1])] = member
         return int(match[1])
 
@@ -98,7 +98,7 @@ class Archive:
         return f"{self._path}: {member.name}", stream.read()
 
     def _broken(self, error: Exception) -> InputError:
-        return InputError(f"{self._path}: cannot be read ({error}); copied incompletely, or not a .tar.gz?")
+        return InputError(self._path, f"cannot be read ({error})", "copied incompletely, or not a .tar.gz?")
 
 
 def numbered_members(folder: Path, name: str, pattern: str) -> Folder | Archive | None:

@@ -27,11 +27,11 @@ def write_scared(frames: Sequence[Frame], path: Path, archives: bool = True, met
     rendered: the left is shown in its place, without points. The video is compressed (H.264), so colours are not exact.
     """
     if not len(frames):
-        raise InputError(f"{path}: no frames to write")
+        raise InputError(path, "no frames to write", "expected at least one")
     camera = frames[0].camera
     if not isinstance(camera, Pinhole | Brown) or camera.width % 2 or camera.height % 2:
         raise InputError(
-            f"{path}: {camera.name} {camera.width}x{camera.height}; expected a PINHOLE or OPENCV, even sizes"
+            path, f"{camera.name} {camera.width}x{camera.height}", "expected a PINHOLE or OPENCV, even sizes"
         )
     fx, fy, cx, cy, *distortion = camera.with_pixel_center(1.0).params
     matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]

@@ -36,7 +36,7 @@ class FrameSequence(Sequence[Frame]):
         sampled: Sequence[int] | None = None,
     ):
         if not names:
-            raise InputError(f"{source}: no frames in it; expected images with a number in their names")
+            raise InputError(source, "no frames in it", "expected images with a number in their names")
         self.names = list(names)
         self.numbers = [frame_number(name) for name in names]
         self.source = source
@@ -46,8 +46,9 @@ class FrameSequence(Sequence[Frame]):
         if twice:
             same = [name for name, n in zip(self.names, self.numbers, strict=True) if n == min(twice)]
             raise InputError(
-                f"{source}: {' and '.join(same)} have the same number; frames are told apart by it: rename or "
-                "remove one"
+                source,
+                f"{' and '.join(same)} have the same number",
+                "frames are told apart by it: rename or remove one",
             )
 
     def __len__(self) -> int:
@@ -83,7 +84,9 @@ class FrameSequence(Sequence[Frame]):
         or it cannot be read."""
         frame = self.by_number(keyframe.number)
         if frame is None:
-            raise InputError(f"no frame number {keyframe.number} in {self.source}")
+            raise InputError(
+                self.source, f"no frame number {keyframe.number}", "expected the frames that the map was made of"
+            )
         return replace(frame, camera=keyframe.camera)
 
 
@@ -121,7 +124,9 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
         if match:
             number = int(match[1])
             if number in found:
-                raise InputError(f"{folder}: {found[number].name} and {file.name} have the same number")
+                raise InputError(
+                    folder, f"{found[number].name} and {file.name} have the same number", "rename or remove one"
+                )
             found[number] = file
     return found
 
@@ -130,11 +135,12 @@ def read_code(path: Path, ray_z: np.ndarray, whose: str) -> np.ndarray:
     """(H, W) uint16 depth as the file codes it, of the size of the rays. `whose` names the data set in errors."""
     code = read_raw(path)
     if code.dtype != np.uint16 or code.ndim != 2:
-        raise InputError(f"{path}: {code.dtype} of shape {code.shape}; {whose}'s depth is one channel of 16 bits")
+        raise InputError(path, f"{code.dtype} of shape {code.shape}", f"{whose}'s depth is one channel of 16 bits")
     if code.shape != ray_z.shape:
         raise InputError(
-            f"{path}: depth is {code.shape[1]}x{code.shape[0]}, the image {ray_z.shape[1]}x{ray_z.shape[0]}; expected "
-            "the same size"
+            path,
+            f"depth is {code.shape[1]}x{code.shape[0]}, the image {ray_z.shape[1]}x{ray_z.shape[0]}",
+            "expected the same size",
         )
     return code
 
@@ -149,23 +155,24 @@ def read_mask(path: Path, image: Path | None = None) -> np.ndarray:
     """(H, W) bool, True where tissue shows, of the size of the image where one is given. Files come in both polarities:
     the centre of the image decides."""
     if not path.is_file():
-        raise InputError(f"{path}: no such mask")
+        raise InputError(path, "no such mask", "correct its name, or put it there")
     grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if grey is None:
-        raise InputError(f"{path}: not a readable mask; expected an image, white where tissue shows")
+        raise InputError(path, "not a readable mask", "expected an image, white where tissue shows")
     mask = grey > 127
     height, width = mask.shape
     if image is not None and image_size(image) != (width, height):
         wide, high = image_size(image)
         raise InputError(
-            f"{path}: the mask is {width}x{height}, but {image.name} is {wide}x{high}; expected a mask of the images' "
-            "size"
+            path,
+            f"the mask is {width}x{height}, but {image.name} is {wide}x{high}",
+            "expected a mask of the images' size",
         )
     centre = mask[int(height * 0.45) : int(height * 0.55) + 1, int(width * 0.45) : int(width * 0.55) + 1]
     mask = mask if centre.mean() >= 0.5 else ~mask
     mask.flags.writeable = False  # one for all frames of a sequence
     if mask.all() and not (grey > 127).any():
-        raise InputError(f"{path}: the mask is black everywhere; expected white where tissue shows")
+        raise InputError(path, "the mask is black everywhere", "expected white where tissue shows")
     return mask
 
 
@@ -193,8 +200,10 @@ def check_one_size(images: Sequence[Path]) -> None:
         example = next(image for image, size in sizes.items() if size == usual)
         width, height = sizes[odd[0]]
         raise InputError(
-            f"{odd[0]}: is {width}x{height}, but {example.name} is {usual[0]}x{usual[1]} ({len(odd)} of {len(sizes)} "
-            "images differ); expected one size in a sequence: sort them into folders by size"
+            odd[0],
+            f"is {width}x{height}, but {example.name} is {usual[0]}x{usual[1]} ({len(odd)} of {len(sizes)} images "
+            "differ)",
+            "expected one size in a sequence: sort them into folders by size",
         )
 
 

@@ -54,20 +54,21 @@ def read_simcol(
     colour, depth = numbered_files(path, _COLOUR), numbered_files(path, _DEPTH)
     images = [colour[n] for n in sorted(colour)]
     if not images:
-        raise InputError(f"{path}: no FrameBuffer_NNNN.png in it; is it a Frames_ folder of SimCol3D?")
+        raise InputError(path, "no FrameBuffer_NNNN.png in it", "is it a Frames_ folder of SimCol3D?")
     numbers = checked_images(path, images, depth)
     if camera is None:
         file = camera_file(path)
         if file is None:
-            raise InputError(f"{path}: no cam.txt here or in the folder above; put it there, or give --camera FILE")
+            raise InputError(path, "no cam.txt here or in the folder above", "put it there, or give --camera FILE")
         height, width = read_image(images[0]).shape[:2]
         # read_camera takes a bare matrix as OpenCV's, with the first centre at (0, 0): undone
         camera = read_camera(file, (width, height)).with_pixel_center(1.0)
     poses = _read_poses(path)
     if poses is not None and numbers[-1] >= len(poses):
         raise InputError(
-            f"{_pose_file(path, _POSITION)}: {len(poses)} poses, but there is a frame {numbers[-1]}; expected a line "
-            "for each frame, from frame 0"
+            f"{_pose_file(path, _POSITION)}",
+            f"{len(poses)} poses, but there is a frame {numbers[-1]}",
+            "expected a line for each frame, from frame 0",
         )
     ray_z = camera.rays()[0][..., 2]
     return frames_of(
@@ -94,10 +95,12 @@ def write_simcol(frames: Sequence[Frame], path: Path) -> None:
     """A trajectory as SimCol3D ships it, in path (`.../Frames_S1`), its poses and camera in the folder above. The
     frames are of one pinhole camera and numbered from 0 without a gap; distance and poses where they have them."""
     if [frame.number for frame in frames] != list(range(len(frames))) or not len(frames):
-        raise InputError(f"{path}: the frames are not numbered 0, 1, 2, ...; SimCol3D's poses are told apart by line")
+        raise InputError(
+            path, "the frames are not numbered 0, 1, 2, ...", "number them so: SimCol3D's poses are told apart by line"
+        )
     camera = frames[0].camera
     if not isinstance(camera, Pinhole):
-        raise InputError(f"{path}: a {camera.name} camera; cam.txt holds a PINHOLE alone")
+        raise InputError(path, f"a {camera.name} camera", "convert it: cam.txt holds a PINHOLE alone")
     path.mkdir(parents=True)
     positions, quaternions = [], []
     for frame in frames:
@@ -140,16 +143,19 @@ def _read_poses(path: Path) -> np.ndarray | None:
     if position is None or rotation is None:
         missing = _POSITION if position is None else _ROTATION
         raise InputError(
-            f"{position or rotation}: there is no {missing}_{_scene(path)}.txt beside it; add it, or remove both to "
-            "read the frames without poses"
+            f"{position or rotation}",
+            f"there is no {missing}_{_scene(path)}.txt beside it",
+            "add it, or remove both to read the frames without poses",
         )
     centres, quaternions = _numbers(position, "x y z"), _numbers(rotation, "qx qy qz qw")
     if len(centres) != len(quaternions):
-        raise InputError(f"{position}: {len(centres)} lines, but {rotation.name} has {len(quaternions)}")
+        raise InputError(
+            position, f"{len(centres)} lines, but {rotation.name} has {len(quaternions)}", "expected as many in both"
+        )
     length = np.linalg.norm(quaternions, axis=1)
     if (np.abs(length - 1) > 1e-2).any():
         line = int((np.abs(length - 1) > 1e-2).argmax())
-        raise InputError(f"{rotation}: line {line + 1}: the quaternion's length is {length[line]:.4g}; expected 1")
+        raise InputError(rotation, f"line {line + 1}: the quaternion's length is {length[line]:.4g}", "expected 1")
     unity = np.tile(np.eye(4), (len(centres), 1, 1))
     unity[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
     unity[:, :3, 3] = centres * 10
@@ -160,9 +166,13 @@ def _numbers(path: Path, columns: str) -> np.ndarray:
     try:
         rows = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not lines of `{columns}` ({error})") from error
+        raise InputError(path, f"not lines of numbers ({error})", f"expected `{columns}` on each") from error
     if rows.shape[1] != len(columns.split()):
-        raise InputError(f"{path}: {rows.shape[1]} numbers a line; expected `{columns}`")
+        raise InputError(path, f"{rows.shape[1]} numbers a line", f"expected `{columns}`")
     if not np.isfinite(rows).all():
-        raise InputError(f"{path}: line {int((~np.isfinite(rows)).any(1).argmax()) + 1} has NaN or infinite numbers")
+        raise InputError(
+            path,
+            f"line {int((~np.isfinite(rows)).any(1).argmax()) + 1} has NaN or infinite numbers",
+            "expected a pose for each frame",
+        )
     return rows

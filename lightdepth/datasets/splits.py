@@ -94,10 +94,10 @@ def read_split(path: Path) -> Split:
         if (entries := getattr(found.parts, part)) is not None
     }
     if not parts:
-        raise InputError(f"{path}: no parts in it; expected {', '.join(PARTS)}, at least one of them")
+        raise InputError(path, "no parts in it", f"expected {', '.join(PARTS)}, at least one of them")
     for part, chosen in parts.items():
         if not chosen:
-            raise InputError(f"{path}: {part} is empty; name its sequences, or leave it out")
+            raise InputError(path, f"{part} is empty", "name its sequences, or leave it out")
     info = _info(path, found.dataset)
     if info is not None:
         _check_known(path, [c.name for chosen in parts.values() for c in chosen] + list(found.leaks), info)
@@ -106,7 +106,7 @@ def read_split(path: Path) -> Split:
     if found.unit == "patient":
         _check_patients(path, parts, found.patients)
     elif found.patients:
-        raise InputError(f"{path}: patients, but unit is sequence; expected unit: patient, or no patients")
+        raise InputError(path, "patients, but unit is sequence", "expected unit: patient, or no patients")
     for name, why in found.leaks.items():
         warnings.warn(f"{path}: {name} leaks: {why}", stacklevel=2)
     return Split(path, parts, found.leaks, info)
@@ -119,14 +119,15 @@ def folders(split: Split, root: Path, parts: Iterable[str]) -> dict[str, list[tu
     """
     root = Path(root)
     if not root.is_dir():
-        raise InputError(f"{root}: no such folder; expected the one that holds the sequences of {split.path}")
+        raise InputError(root, "no such folder", f"expected the one that holds the sequences of {split.path}")
     found = {part: [(located(root, c.name), c) for c in chosen] for part, chosen in split.parts.items()}
     asked = [part for part in parts if part in found]
     missing = [c.name for part in asked for folder, c in found[part] if folder is None]
     if missing:
         raise InputError(
-            f"{root}: {len(missing)} of the sequences of {split.path} are not there: {', '.join(missing)}; download "
-            "them, or correct --data.root"
+            root,
+            f"{len(missing)} of the sequences of {split.path} are not there: {', '.join(missing)}",
+            "download them, or correct --data.root",
         )
     _check_same_folder(split, found)
     return {part: [(folder, c) for folder, c in found[part] if folder is not None] for part in asked}
@@ -139,8 +140,9 @@ def check_apart(train: Iterable[str | Path], val: Iterable[str | Path]) -> None:
             one, other = Path(a).resolve(), Path(b).resolve()
             if one == other or one in other.parents or other in one.parents:
                 raise InputError(
-                    f"{b}: is validated on, but also trained on{'' if str(a) == str(b) else f' (as {a})'}; "
-                    "a validation on frames of the training says nothing. Give other sequences"
+                    b,
+                    f"is validated on, but also trained on{'' if str(a) == str(b) else f' (as {a})'}",
+                    "give other sequences: a validation on frames of the training says nothing",
                 )
 
 
@@ -150,11 +152,11 @@ def _chosen(entry: str, where: str) -> Chosen:
     if match:
         name, frames = match[1], (int(match[2]), int(match[3]))
         if frames[0] >= frames[1]:
-            raise InputError(f"{where}: {entry}: no frames in [{match[2]}:{match[3]}]; expected [first:last + 1]")
+            raise InputError(f"{where}: {entry}", f"no frames in [{match[2]}:{match[3]}]", "expected [first:last + 1]")
     try:
         return Chosen(inside(name), frames)
-    except ValueError as error:
-        raise InputError(f"{where}: {error}") from error
+    except InputError as error:
+        raise error.within(where) from error
 
 
 def same_sequence(name: str) -> str:
@@ -189,8 +191,8 @@ def _check_known(path: Path, names: list[str], info: DatasetInfo) -> None:
         import difflib
 
         close = difflib.get_close_matches(strange[0], info.sequences, 1)
-        hint = f"; is {close[0]} meant?" if close else f"; it has {', '.join(list(info.sequences)[:6])}, ..."
-        raise InputError(f"{path}: {info.name} has no sequence {', '.join(strange)}{hint}")
+        hint = f"is {close[0]} meant?" if close else f"it has {', '.join(list(info.sequences)[:6])}, ..."
+        raise InputError(path, f"{info.name} has no sequence {', '.join(strange)}", hint)
 
 
 def _check_overlap(path: Path, parts: Mapping[str, tuple[Chosen, ...]], leaks: Mapping[str, str]) -> None:
@@ -203,19 +205,20 @@ def _check_overlap(path: Path, parts: Mapping[str, tuple[Chosen, ...]], leaks: M
             for other_part, other in before.setdefault(key, []):
                 also = "" if other.name == c.name else f", which is {other.name},"
                 if other_part == part:
-                    raise InputError(f"{path}: {part} has {c}{also} twice; leave one")
-                where = f"{path}: {c} of {part}{also} is in {other_part} too"
+                    raise InputError(path, f"{part} has {c}{also} twice", "leave one")
+                found = f"{c} of {part}{also} is in {other_part} too"
                 if key not in allowed:
                     raise InputError(
-                        f"{where}; a sequence belongs to one part. A published split that cuts it in two says so under "
-                        "leaks"
+                        path,
+                        found,
+                        "a sequence belongs to one part. A published split that cuts it in two says so under leaks",
                     )
                 if c.frames is None or other.frames is None or _meet(c.frames, other.frames):
-                    raise InputError(f"{where} ({other}), with frames in both; give ranges that do not meet")
+                    raise InputError(path, f"{found} ({other}), with frames in both", "give ranges that do not meet")
             before[key].append((part, c))
     pointless = [name for name in leaks if len(before.get(same_sequence(name), [])) < 2]
     if pointless:
-        raise InputError(f"{path}: leaks: {pointless[0]} is not in two parts; leave it out")
+        raise InputError(path, f"leaks: {pointless[0]} is not in two parts", "leave it out")
 
 
 def _meet(a: tuple[int, int], b: tuple[int, int]) -> bool:
@@ -227,7 +230,7 @@ def _check_excluded(path: Path, parts: Mapping[str, tuple[Chosen, ...]], exclude
         for c in chosen:
             for name, why in excluded.items():
                 if f"{same_sequence(c.name)}/".startswith(f"{same_sequence(name)}/"):
-                    raise InputError(f"{path}: {c.name} is in {part}, but excluded ({why}); leave it out of one")
+                    raise InputError(path, f"{c.name} is in {part}, but excluded ({why})", "leave it out of one")
 
 
 def _check_patients(
@@ -240,12 +243,13 @@ def _check_patients(
             of = [who for who, names in patients.items() if _matches(key, names)]
             if len(of) != 1:
                 found = f"patients {' and '.join(of)}" if of else "no patient"
-                raise InputError(f"{path}: {c.name} has {found}; expected one, under patients")
+                raise InputError(path, f"{c.name} has {found}", "expected one, under patients")
             other_part, other = seen.setdefault(of[0], (part, c))
             if other_part != part:
                 raise InputError(
-                    f"{path}: {c.name} of {part} and {other.name} of {other_part} are of the same patient, {of[0]}; "
-                    "a patient belongs to one part"
+                    path,
+                    f"{c.name} of {part} and {other.name} of {other_part} are of the same patient, {of[0]}",
+                    "a patient belongs to one part",
                 )
 
 
@@ -262,7 +266,7 @@ def located(root: Path, name: str) -> Path | None:
     siblings = sorted(p for p in above.iterdir() if p.is_dir()) if above.is_dir() else []
     same = [p for p in siblings if same_sequence(f"{name.rpartition('/')[0]}/{p.name}".lstrip("/")) == key]
     if len(same) > 1:
-        raise InputError(f"{above}: {' and '.join(p.name for p in same)} are both {name}; keep one")
+        raise InputError(above, f"{' and '.join(p.name for p in same)} are both {name}", "keep one")
     return same[0] if same else None
 
 
@@ -276,6 +280,7 @@ def _check_same_folder(split: Split, found: Mapping[str, list[tuple[Path | None,
             other_part, other = before.setdefault(folder.resolve(), (part, c))
             if same_sequence(other.name) != same_sequence(c.name):
                 raise InputError(
-                    f"{folder}: {c.name} of {part} is the same folder as {other.name} of {other_part} in {split.path}; "
-                    "a sequence belongs to one part"
+                    folder,
+                    f"{c.name} of {part} is the same folder as {other.name} of {other_part} in {split.path}",
+                    "a sequence belongs to one part",
                 )

@@ -143,8 +143,10 @@ class VideoFile:
         count = len(self._index.pts)
         if index >= count:
             raise InputError(
-                f"{self.path}: frame {index} is not there; the header announces {len(self)} frames and {count} are in "
-                "the file, which was cut off. Copy it again, or use the frames before"
+                self.path,
+                f"frame {index} is not there: the header announces {len(self)} frames and {count} are in the file, "
+                "which was cut off",
+                "copy it again, or use the frames before",
             )
         if self._last is None or self._last[0] != index:
             self._last = (index, self._pixels(self._decoded_at(index)))
@@ -156,8 +158,9 @@ class VideoFile:
             at, frame = self._upcoming(decoder)
             if frame is None or at > index:
                 raise InputError(
-                    f"{self.path}: frame {index} of {len(self)} does not decode; the file is damaged there. Others are "
-                    "given: leave this one out"
+                    self.path,
+                    f"frame {index} of {len(self)} does not decode: the file is damaged there",
+                    "leave this one out; others are given",
                 )
             decoder.pending, decoder.at = None, at + 1
             if at == index:
@@ -207,10 +210,14 @@ class VideoFile:
         try:
             container = av.open(str(self.path), options={"format_whitelist": _FORMATS, "protocol_whitelist": "file"})
         except (av.error.FFmpegError, OSError) as error:
-            raise InputError(f"{self.path}: not a video that can be read ({error.strerror or error})") from error
+            raise InputError(
+                self.path,
+                f"not a video that can be read ({error.strerror or error})",
+                "copy it again, or convert it to .mp4",
+            ) from error
         if not container.streams.video:
             container.close()
-            raise InputError(f"{self.path}: no pictures in it; expected a video")
+            raise InputError(self.path, "no pictures in it", "expected a video")
         stream = container.streams.video[0]
         # A process that is forked while a decoder has threads, as a DataLoader's workers are, hangs when it frees it.
         stream.thread_type, stream.codec_context.thread_count = "NONE", 1
@@ -221,7 +228,7 @@ class VideoFile:
         with container:
             frame = next(_decoded(container, stream), None)
         if frame is None:
-            raise InputError(f"{self.path}: none of its pictures decodes; it is damaged, or not a video")
+            raise InputError(self.path, "none of its pictures decodes: it is damaged, or not a video", "copy it again")
         return frame
 
     def _counted(self) -> _Index:
@@ -285,7 +292,7 @@ def video_at(path: Path) -> Path | None:
         return None
     videos = sorted(file for file in path.iterdir() if file.is_file() and file.suffix.lower() in VIDEO_SUFFIXES)
     if len(videos) > 1:
-        raise InputError(f"{path}: {len(videos)} videos ({', '.join(v.name for v in videos)}); give one of them")
+        raise InputError(path, f"{len(videos)} videos ({', '.join(v.name for v in videos)})", "give one of them")
     return videos[0] if videos else None
 
 
@@ -307,8 +314,10 @@ def read_video(
         mask = found.mask if mask is None else mask
     if camera is None:
         raise InputError(
-            f"{path}: no camera.json beside it; give --camera FILE "
-            '({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), or a map that has one'
+            path,
+            "no camera.json beside it",
+            'give --camera FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), or a '
+            "map that has one",
         )
     if mask is None:
         mask = _found_mask(video)

@@ -35,12 +35,12 @@ def read_cameras_text(path: Path) -> dict[int, CameraModel]:
     for number, line in numbered_lines(path):
         where, tokens = f"{path}, line {number}", line.split()
         if len(tokens) < 5:
-            raise InputError(f"{where}: found {line.strip()[:60]!r}; expected {expected}")
+            raise InputError(where, f"found {line.strip()[:60]!r}", f"expected {expected}")
         camera_id, width, height = (parse_integer(tokens[k], where, expected) for k in (0, 2, 3))
         params = parse_numbers(tokens[4:], where, expected).tolist()
         cameras[camera_id] = camera_from_params(tokens[1], width, height, params, where)
     if not cameras:
-        raise InputError(f"{path}: no camera in it; expected a line {expected}")
+        raise InputError(path, "no camera in it", f"expected a line {expected}")
     return cameras
 
 
@@ -52,7 +52,9 @@ class BinaryFile:
         try:
             self.data = path.read_bytes()
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+            raise InputError(
+                path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
+            ) from error
 
     def take(self, layout: str) -> tuple[Any, ...]:
         size = struct.calcsize("<" + layout)
@@ -70,13 +72,13 @@ class BinaryFile:
             return name.decode()
         except UnicodeDecodeError as error:
             raise InputError(
-                f"{self.path}: an image name is not text at byte {self.at}; not a COLMAP binary file?"
+                self.path, f"an image name is not text at byte {self.at}", "is it a COLMAP binary file?"
             ) from error
 
     def end(self) -> None:
         if self.at != len(self.data):
             raise InputError(
-                f"{self.path}: {len(self.data) - self.at} bytes too many; not a COLMAP binary file of this kind"
+                self.path, f"{len(self.data) - self.at} bytes too many", "is it a COLMAP binary file of this kind?"
             )
 
     def _next(self, size: int) -> bytes:
@@ -87,7 +89,7 @@ class BinaryFile:
 
     def _short(self) -> InputError:
         return InputError(
-            f"{self.path}: ends too early, at byte {len(self.data)}; copied incompletely, or not COLMAP's?"
+            self.path, f"ends too early, at byte {len(self.data)}", "copied incompletely, or not COLMAP's?"
         )
 
 
@@ -97,7 +99,7 @@ def read_cameras_binary(path: Path) -> dict[int, CameraModel]:
         camera_id, model, width, height = data.take("IiQQ")
         if model not in _BINARY_MODELS:
             known = ", ".join(name for name, _ in _BINARY_MODELS.values())
-            raise InputError(f"{path}: camera {camera_id} has the unknown model number {model}; known are {known}")
+            raise InputError(path, f"camera {camera_id} has the unknown model number {model}", f"known are {known}")
         name, count = _BINARY_MODELS[model]
         cameras[camera_id] = camera_from_params(name, width, height, list(data.take(f"{count}d")), str(path))
     data.end()

@@ -32,20 +32,24 @@ def unit_range(pixels: np.ndarray) -> np.ndarray:
 def read_bytes(path: Path, what: str = "file") -> bytes:
     """The file's bytes, or InputError where it is not there or cannot be read."""
     if not path.is_file():
-        raise InputError(f"{path}: no such {what}")
+        raise InputError(path, f"no such {what}", "correct its name, or put it there")
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+        raise InputError(
+            path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
+        ) from error
 
 
 def decode(data: bytes, flags: int, where: str) -> np.ndarray:
     """cv2's image in a file's bytes. imdecode refuses a truncated JPEG, whose rest imread would paint grey."""
     if not data:
-        raise InputError(f"{where}: not a readable image (the file is empty, 0 bytes)")
+        raise InputError(where, "not a readable image (the file is empty, 0 bytes)", "copy it again, or leave it out")
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
-        raise InputError(f"{where}: not a readable image (truncated, or not an image at all)")
+        raise InputError(
+            where, "not a readable image (truncated, or not an image at all)", "copy it again, or leave it out"
+        )
     return image
 
 

@@ -11,10 +11,10 @@ from lightdepth.errors import InputError
 def pose_from_quaternion(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
     """(4, 4) from a quaternion (w, x, y, z) and a translation (3,)."""
     if not (np.isfinite(quaternion).all() and np.isfinite(translation).all()):
-        raise InputError(f"{where}: the pose has NaN or infinite numbers; leave out what was not localised")
+        raise InputError(where, "the pose has NaN or infinite numbers", "leave out what was not localised")
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 1e-2:
-        raise InputError(f"{where}: quaternion of norm {norm:.4g}; expected 1 (order w x y z)")
+        raise InputError(where, f"quaternion of norm {norm:.4g}", "expected 1 (order w x y z)")
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     pose[:3, 3] = translation

@@ -19,9 +19,11 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(Path(path).read_text())
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+        raise InputError(
+            path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
+        ) from error
     except ValueError as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from error
+        raise InputError(path, f"not valid JSON ({error})", "correct it there") from error
 
 
 def checked_fields(schema: type[_Schema], data: Any, where: str) -> _Schema:
@@ -33,18 +35,19 @@ def checked_fields(schema: type[_Schema], data: Any, where: str) -> _Schema:
         *above, last = [str(part) for part in first["loc"] if part != "[key]"] or ["the file"]
         field = ".".join([*above, last])
         known = _known(schema, above)
-        expected = f"; expected {', '.join(known)}" if known else ""
+        expected = f"expected {', '.join(known)}" if known else "correct it there"
         if first["type"] == "missing":
-            message = f"{field} missing{expected}"
-        elif first["type"] == "extra_forbidden":
+            raise InputError(where, f"{field} missing", expected) from error
+        if first["type"] == "extra_forbidden":
             close = get_close_matches(last, known, 1, cutoff=0.75)
-            message = f"{field} is not known{f' (is {close[0]} meant?)' if close else ''}{expected}"
-        else:
-            message = f"{field}: {first['msg'].removeprefix('Value error, ')}"
-            found = first["input"]
-            if isinstance(found, str | int | float | bool | None) and repr(found) not in message:
-                message += f"; found {found!r}"
-        raise InputError(f"{where}: {message}") from error
+            hint = f" (is {close[0]} meant?)" if close else ""
+            raise InputError(where, f"{field} is not known{hint}", expected) from error
+        found, message = first["input"], first["msg"].removeprefix("Value error, ")
+        said, _, cure = message.partition("; ")
+        if not cure:
+            plain = isinstance(found, str | int | float | bool | None)
+            said, cure = f"found {found!r}" if plain else f"found {type(found).__name__}", said[0].lower() + said[1:]
+        raise InputError(where, f"{field}: {said}", cure) from error
 
 
 def _known(schema: type[BaseModel], above: list[str]) -> list[str]:

@@ -15,11 +15,11 @@ def read_text(path: Path, expected: str) -> str:
     try:
         text = Path(path).read_text(encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {expected}") from error
+        raise InputError(path, f"cannot be read ({error.strerror or error})", expected) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file; {expected}") from error
+        raise InputError(path, "not a text file", expected) from error
     if "\0" in text:
-        raise InputError(f"{path}: not a text file; {expected}")
+        raise InputError(path, "not a text file", expected)
     return text
 
 
@@ -36,9 +36,9 @@ def to_numbers(words: list[str], where: str, expected: str) -> list[float]:
         try:
             numbers.append(float(word))
         except ValueError:
-            raise InputError(f"{where}: found {word!r}, which is not a number; expected {expected}") from None
+            raise InputError(where, f"found {word!r}, which is not a number", f"expected {expected}") from None
         if not np.isfinite(numbers[-1]):
-            raise InputError(f"{where}: {word} is not finite; expected {expected}")
+            raise InputError(where, f"{word} is not finite", f"expected {expected}")
     return numbers
 
 
@@ -46,9 +46,11 @@ def text_lines(path: Path) -> list[str]:
     try:
         return path.read_text(encoding="utf-8").split("\n")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+        raise InputError(
+            path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
+        ) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file; a binary model's files end in .bin") from error
+        raise InputError(path, "not a text file", "a binary model's files end in .bin") from error
 
 
 def is_comment(line: str) -> bool:
@@ -72,7 +74,7 @@ def parse_numbers(tokens: list[str], where: str, expected: str) -> np.ndarray:
             try:
                 float(token)
             except ValueError:
-                raise InputError(f"{where}: found {token!r}, which is not a number; expected {expected}") from None
+                raise InputError(where, f"found {token!r}, which is not a number", f"expected {expected}") from None
         raise
 
 
@@ -80,4 +82,4 @@ def parse_integer(token: str, where: str, expected: str) -> int:
     try:
         return int(token)
     except ValueError:
-        raise InputError(f"{where}: found {token!r}, which is not an integer; expected {expected}") from None
+        raise InputError(where, f"found {token!r}, which is not an integer", f"expected {expected}") from None

@@ -26,16 +26,18 @@ def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         rows = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a TUM trajectory ({error})") from error
+        raise InputError(
+            path, f"not a TUM trajectory ({error})", "expected lines of 8 numbers: t tx ty tz qx qy qz qw"
+        ) from error
     if rows.shape[1] != 8:
-        raise InputError(f"{path}: {rows.shape[1]} columns; a TUM trajectory has 8: t tx ty tz qx qy qz qw")
+        raise InputError(path, f"{rows.shape[1]} columns", "expected 8: t tx ty tz qx qy qz qw")
     if not np.isfinite(rows).all():
         line = int((~np.isfinite(rows)).any(1).argmax()) + 1
-        raise InputError(f"{path}: line {line} has NaN or infinite numbers; expected a pose for each frame")
+        raise InputError(path, f"line {line} has NaN or infinite numbers", "expected a pose for each frame")
     length = np.linalg.norm(rows[:, 4:], axis=1)
     if (length < 1e-6).any():
         raise InputError(
-            f"{path}: line {int((length < 1e-6).argmax()) + 1}: the quaternion qx qy qz qw is zero; expected length 1"
+            path, f"line {int((length < 1e-6).argmax()) + 1}: the quaternion qx qy qz qw is zero", "expected length 1"
         )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()

@@ -39,7 +39,7 @@ def write_together(contents: Mapping[Path, Content]) -> None:
                 sync(folder)
         except OSError as error:
             where = error.filename or next(iter(contents))
-            raise InputError(f"{where}: cannot be written ({error.strerror or error})") from error
+            raise InputError(where, f"cannot be written ({error.strerror or error})", "choose another place") from error
 
 
 def move_whole(made: Path, path: Path) -> None:

@@ -41,7 +41,7 @@ class PictureConfig:
 
     def __post_init__(self) -> None:
         if self.size is not None and min(self.size) < 1:
-            raise InputError(f"--size {self.size}; expected a positive width and height")
+            raise InputError("--size", f"{self.size}", "expected a positive width and height")
 
 
 @dataclass(frozen=True)

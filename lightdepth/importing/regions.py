@@ -36,7 +36,7 @@ def find_regions(source: Source, find_text: bool, given_text: np.ndarray | None,
         if pixels.shape[:2] == (source.height, source.width):
             images.append(one_field(pixels) if deinterlace else pixels)
     if not images:
-        raise InputError("none of the frames looked at could be read; copy the data again")
+        raise InputError("the frames", "none of those looked at could be read", "copy the data again")
     floats = [unit_range(image) for image in images]
     mask, region = border_mask(floats), border_region(floats)
     nothing = np.zeros(mask.shape, bool)
@@ -44,8 +44,9 @@ def find_regions(source: Source, find_text: bool, given_text: np.ndarray | None,
     tissue = mask if source.mask is None else source.mask
     if tissue.shape != mask.shape:
         raise InputError(
-            f"the mask is {tissue.shape[1]}x{tissue.shape[0]}, the images {source.width}x{source.height}; expected the "
-            "same size"
+            "the mask",
+            f"it is {tissue.shape[1]}x{tissue.shape[0]}, the images {source.width}x{source.height}",
+            "expected the same size",
         )
     text = overlay.mask if given_text is None else overlay.mask | given_text
     shown = cv2.dilate((region | tissue).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -56,10 +57,10 @@ def read_overlay_mask(path: Path, source: Source) -> np.ndarray:
     """(H, W) bool of a file that is white where text is. Unlike a mask's, its polarity is not guessed."""
     grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if grey is None:
-        raise InputError(f"{path}: not a readable image; expected one that is white where text is")
+        raise InputError(path, "not a readable image", "expected one that is white where text is")
     if grey.shape != (source.height, source.width):
         size = f"{source.width}x{source.height}"
-        raise InputError(f"{path}: {grey.shape[1]}x{grey.shape[0]}; expected {size}, as the images are")
+        raise InputError(path, f"{grey.shape[1]}x{grey.shape[0]}", f"expected {size}, as the images are")
     return grey > 127
 
 

@@ -37,7 +37,9 @@ def scanned(source: Source, tissue: np.ndarray, choice: Choice, deinterlace: boo
             try:
                 pixels, time = source.read(i)
                 if pixels.shape[:2] != tissue.shape:
-                    raise InputError(f"frame {source.numbers[i]} has another size than the first")
+                    raise InputError(
+                        f"frame {source.numbers[i]}", "it has another size than the first", "expected one size"
+                    )
             except InputError:
                 rows.append(i)
                 times.append(np.nan)
@@ -50,7 +52,7 @@ def scanned(source: Source, tissue: np.ndarray, choice: Choice, deinterlace: boo
             times.append(time)
             meter.add(one_field(pixels) if deinterlace else pixels)
     if not rows:
-        raise InputError(f"no frames between --start {start:g} and --end {last:g} seconds")
+        raise InputError(f"--start {start:g} --end {last:g}", "no frames between these seconds", "choose others")
     return Scan(np.array(rows), np.array(times), meter.result())
 
 

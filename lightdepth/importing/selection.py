@@ -38,17 +38,19 @@ class Choice:
 
     def __post_init__(self) -> None:
         if self.end is not None and self.end <= self.start:
-            raise InputError(f"--start {self.start} --end {self.end}; expected an end after the start")
+            raise InputError("--start", f"{self.start} --end {self.end}", "expected an end after the start")
         if self.rate is not None and self.every is not None:
-            raise InputError(f"--rate {self.rate} and --every {self.every}; give one of them")
+            raise InputError(
+                "--rate, --every", f"{self.rate} and {self.every}, which are both given", "give one of them"
+            )
         if self.rate is not None and not self.rate > 0:
-            raise InputError(f"--rate {self.rate}; expected frames per second above 0")
+            raise InputError("--rate", f"{self.rate}", "expected frames per second above 0")
         if self.every is not None and self.every < 1:
-            raise InputError(f"--every {self.every}; expected 1 or more")
+            raise InputError("--every", f"{self.every}", "expected 1 or more")
         if not 0 <= self.blur < 1:
-            raise InputError(f"--blur {self.blur}; expected a share of at least 0 and below 1")
+            raise InputError("--blur", f"{self.blur}", "expected a share of at least 0 and below 1")
         if self.max_frames is not None and self.max_frames < 1:
-            raise InputError(f"--max-frames {self.max_frames}; expected 1 or more")
+            raise InputError("--max-frames", f"{self.max_frames}", "expected 1 or more")
 
 
 def selected(times: np.ndarray, measures: Measures, choice: Choice) -> np.ndarray:
@@ -65,7 +67,7 @@ def selected(times: np.ndarray, measures: Measures, choice: Choice) -> np.ndarra
         good = good[good % choice.every == 0]
     elif choice.rate is not None:
         if np.isnan(times[good]).any():
-            raise InputError("--rate: the frames have no times; choose with --every N")
+            raise InputError("--rate", "the frames have no times", "choose with --every N")
         interval = np.floor((times[good] - np.nanmin(times)) * choice.rate + 1e-6).astype(int)
         # Sorted by interval, the sharpest first; of each interval the first.
         order = np.lexsort((-measures.sharpness[good], interval))

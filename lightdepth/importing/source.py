@@ -52,7 +52,11 @@ def open_source(source: SequenceSource) -> tuple[Source, list[Path]]:
     if video is not None:
         return _of_video(VideoFile(video), source.camera, source.light, source.mask), [video]
     if path.is_file():
-        raise InputError(f"{path}: expected a video such as .mp4 or .mov, or a folder of frames")
+        raise InputError(
+            path,
+            "neither a video that is known nor a folder",
+            "expected a video such as .mp4 or .mov, or a folder of frames",
+        )
     frames, missing = _sequence(source)
     first = frames[0]
 

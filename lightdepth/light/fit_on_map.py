@@ -178,8 +178,10 @@ def fit_on_map(
             samples.append(found)
     if len(views) < 4:
         raise InputError(
-            f"{sparse_map.source}: {len(views)} keyframes with at least {least} observed points on pixels that are "
-            "neither black nor saturated; expected at least 4 to find the light from"
+            sparse_map.source,
+            f"{len(views)} keyframes with at least {least} observed points on pixels that are neither black nor "
+            "saturated",
+            "expected at least 4 to find the light from",
         )
     gamma, mu, uncertainty, residuals = fit_samples(samples[::2], rng)
     fitted = PhotometricCalibration(gamma=gamma, mu=mu, source="measured")

@@ -80,8 +80,9 @@ def fit_on_truth(frames: FrameSequence, rng: np.random.Generator | None = None, 
     usable = [pixels for pixels in found if pixels is not None]
     if len(usable) < 4:
         raise InputError(
-            f"{frames.source}: {len(usable)} frames with known distance on pixels that are neither black nor "
-            "saturated; expected at least 4. Without depth, give a sparse map: --map MAP"
+            frames.source,
+            f"{len(usable)} frames with known distance on pixels that are neither black nor saturated",
+            "expected at least 4. Without depth, give a sparse map: --map MAP",
         )
     fit, judge = usable[::2], usable[1::2]
     candidates = []

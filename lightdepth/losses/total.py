@@ -66,7 +66,11 @@ def self_supervised_loss(
     compared, rendered = residual, image
     if config.space != "log" or config.ssim > 0:
         if albedo_hs is None:
-            raise InputError(f"loss space {config.space!r}, ssim {config.ssim}: no colours without albedo")
+            raise InputError(
+                "loss",
+                f"space {config.space!r}, ssim {config.ssim}, but no colours without albedo",
+                "take space log and ssim 0, or a network that gives albedo",
+            )
         rendered = lit.rendered_rgb(seen.log_v - residual, albedo_hs, light.gamma)
     if config.space != "log":
         compared = lit.rgb_residual(image, rendered, light.gamma, config.space)

@@ -53,18 +53,18 @@ def checked(submap: Submap, where: Path) -> Submap:
     if median <= MAX_MEDIAN_PX and share >= _MIN_SHARE_IN_VIEW:
         _whisper_half_a_pixel(submap, where, median)
         return submap
-    found = f"{where}: median reprojection error {median:.1f} px, {share:.0%} of the observations in view"
+    found = f"median reprojection error {median:.1f} px, {share:.0%} of the observations in view"
     if not share:
-        found = f"{where}: none of the keyframes has a point that it observed in its view"
+        found = "none of the keyframes has a point that it observed in its view"
     fits = {what: reprojection(other(submap)) for what, other in _OTHER_READINGS.items()}
     fits = {what: fit for what, fit in fits.items() if fit[0] < MAX_MEDIAN_PX and fit[1] >= _MIN_SHARE_IN_VIEW}
     if fits:
         best = min(fits, key=lambda what: fits[what][0])
-        raise InputError(f"{found}; it would be {fits[best][0]:.2f} px {best}")
+        raise InputError(where, found, f"it would be {fits[best][0]:.2f} px {best}")
     warnings.warn(
-        f"{found}; expected about 1 px, at most {MAX_MEDIAN_PX:g}. Inverse poses, half and double camera size, "
-        "quaternion order and undistorted keypoints do not explain it: check that cameras, images and points3D belong "
-        "together",
+        f"{where}: {found}; expected about 1 px, at most {MAX_MEDIAN_PX:g}. Inverse poses, half and double camera "
+        "size, quaternion order and undistorted keypoints do not explain it: check that cameras, images and points3D "
+        "belong together",
         stacklevel=2,
     )
     return submap
@@ -97,8 +97,10 @@ def seen_by_projection(submap: Submap, hide: bool = False) -> Submap:
         keyframes.append(replace(keyframe, pixels=pixels[valid], point_ids=submap.point_ids[valid]))
     if not any(len(k.point_ids) for k in keyframes):
         raise InputError(
-            f"map {submap.id}: no keyframe observed a point, and none has a point in its view; are the poses those of "
-            f'the format, or of "pose_convention" in {SIDECAR}, and do points and poses belong to the same map?'
+            f"map {submap.id}",
+            "no keyframe observed a point, and none has a point in its view",
+            f'are the poses those of the format, or of "pose_convention" in {SIDECAR}, and do points and poses belong '
+            "to the same map?",
         )
     return replace(submap, keyframes=tuple(keyframes), weak_visibility=True)
 

@@ -59,13 +59,14 @@ def read_submap(folder: Path, map_id: int, convention: MapConvention = COLMAP) -
         cameras, images = read_cameras_text(paths["cameras"]), _read_images_text(paths["images"])
         ids, points = read_points_text(paths["points3D"])
     if not images:
-        raise InputError(f"{paths['images']}: no images in it; an empty map cannot be densified, leave it out")
+        raise InputError(f"{paths['images']}", "no images in it", "an empty map cannot be densified, leave it out")
     keyframes = []
     for image in images:
         if image.camera_id not in cameras:
             raise InputError(
-                f"{paths['images']}: image {image.name} has camera {image.camera_id}; "
-                f"{paths['cameras'].name} has {', '.join(map(str, cameras)) or 'none'}"
+                f"{paths['images']}",
+                f"image {image.name} has camera {image.camera_id}",
+                f"expected one of {paths['cameras'].name}, which has {', '.join(map(str, cameras)) or 'none'}",
             )
         keyframes.append(
             convention.keyframe(image.name, cameras[image.camera_id], image.pose, image.pixels, image.point_ids)
@@ -83,16 +84,16 @@ def assembled(
 ) -> Submap:
     """The checked submap of keyframes, point ids (n,) and points (n, 3); every error names the folder."""
     if not len(points):
-        raise InputError(f"{folder}: no points in points3D; an empty map cannot be densified, leave it out")
+        raise InputError(folder, "no points in points3D", "an empty map cannot be densified, leave it out")
     order = np.argsort(ids, kind="stable")
     ids, points = ids[order], points[order]
     twice = ids[1:][ids[1:] == ids[:-1]]
     if len(twice):
-        raise InputError(f"{folder}: point {twice[0]} is in points3D twice; every point needs its own id")
+        raise InputError(folder, f"point {twice[0]} is in points3D twice", "every point needs its own id")
     try:
         submap = Submap(map_id, tuple(sorted(keyframes, key=lambda k: k.number)), ids, points)
     except InputError as error:
-        raise InputError(f"{folder}: {error}") from error
+        raise error.within(folder) from error
     return check(submap, folder)
 
 
@@ -104,7 +105,7 @@ def _suffix(folder: Path) -> str:
             return suffix
     absent = min(missing.values(), key=len)
     raise InputError(
-        f"{folder}: {' and '.join(absent)} missing; a model is cameras, images and points3D, all .txt or all .bin"
+        folder, f"{' and '.join(absent)} missing", "a model is cameras, images and points3D, all .txt or all .bin"
     )
 
 
@@ -120,7 +121,7 @@ def _read_images_text(path: Path) -> list[ModelImage]:
             continue
         where, tokens = f"{path}, line {number}", line.split(None, 9)
         if len(tokens) < 10:
-            raise InputError(f"{where}: found {line.strip()[:60]!r}; expected {expected}, then a line of keypoints")
+            raise InputError(where, f"found {line.strip()[:60]!r}", f"expected {expected}, then a line of keypoints")
         parse_integer(tokens[0], where, expected)
         camera_id, name = parse_integer(tokens[8], where, expected), tokens[9].strip()
         numbers = parse_numbers(tokens[1:8], where, expected)
@@ -130,12 +131,12 @@ def _read_images_text(path: Path) -> list[ModelImage]:
         keypoints = parse_numbers(line.split(), where, f"{triples} (the keypoints of {name})")
         if len(keypoints) % 3:
             raise InputError(
-                f"{where}: {len(keypoints)} numbers; expected {triples}: the keypoints of {name}, or an empty line"
+                where, f"{len(keypoints)} numbers", f"expected {triples}: the keypoints of {name}, or an empty line"
             )
         keypoints = keypoints.reshape(-1, 3)
         keypoints = keypoints[(keypoints[:, 2] >= 0) & (keypoints[:, 2] < _NO_POINT)]
         if not np.isfinite(keypoints).all():
-            raise InputError(f"{where}: NaN or infinite keypoints of {name}; expected pixels")
+            raise InputError(where, f"NaN or infinite keypoints of {name}", "expected pixels")
         images.append(ModelImage(name, camera_id, pose, keypoints[:, :2].copy(), keypoints[:, 2].astype(np.int64)))
     return images
 
@@ -151,15 +152,16 @@ def read_points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
         for number, tokens in entries:
             where = f"{path}, line {number}"
             if len(tokens) < 4:
-                raise InputError(f"{where}: found {' '.join(tokens)!r}; expected {expected}") from None
+                raise InputError(where, f"found {' '.join(tokens)!r}", f"expected {expected}") from None
             parse_integer(tokens[0], where, expected)
             parse_numbers(tokens[1:], where, expected)
         raise
     bad = np.flatnonzero(~np.isfinite(points).all(1))
     if len(bad):
         raise InputError(
-            f"{path}, line {entries[bad[0]][0]}: point {ids[bad[0]]} is not finite ({len(bad)} such); "
-            "expected finite X Y Z"
+            f"{path}, line {entries[bad[0]][0]}",
+            f"point {ids[bad[0]]} is not finite ({len(bad)} such)",
+            "expected finite X Y Z",
         )
     return ids, points
 
@@ -177,7 +179,7 @@ def _read_images_binary(path: Path) -> list[ModelImage]:
         found = data.array(keypoint, data.take("Q")[0])
         found = found[found["id"] < _NO_POINT]
         if not np.isfinite(found["xy"]).all():
-            raise InputError(f"{path}: NaN or infinite keypoints of {name}; expected pixels")
+            raise InputError(path, f"NaN or infinite keypoints of {name}", "expected pixels")
         images.append(ModelImage(name, numbers[8], pose, found["xy"].copy(), found["id"].astype(np.int64)))
     data.end()
     return images
@@ -193,7 +195,7 @@ def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
         points.append(xyz)
     data.end()
     if ids and max(ids) >= _NO_POINT:
-        raise InputError(f"{path}: point id {max(ids)}; expected ids below 2^63")
+        raise InputError(path, f"point id {max(ids)}", "expected ids below 2^63")
     return np.array(ids, np.int64), np.array(points, np.float64).reshape(-1, 3)
 
 

@@ -66,7 +66,7 @@ _MAX_FRAME = 10**8  # a month of video; a time of day in seconds or nanoseconds 
 
 def _zero_or_half(value: float) -> float:
     if value not in (0.0, 0.5):
-        raise ValueError(f"found {value}; expected 0.0 (OpenCV) or 0.5 (COLMAP)")
+        raise ValueError("expected 0.0 (OpenCV) or 0.5 (COLMAP)")
     return value
 
 
@@ -91,7 +91,7 @@ def declared_convention(folder: Path, map_id: int, habit: MapConvention, roots: 
         return habit
     found = checked_fields(_Sidecar, read_json(path), str(path))
     if found.map_id is not None and path.parent == folder and found.map_id != map_id:
-        raise InputError(f"{path}: map_id {found.map_id} in the folder of map {map_id}; correct one of the two")
+        raise InputError(path, f"map_id {found.map_id} in the folder of map {map_id}", "correct one of the two")
     names = ("pixel_center", "pose_convention", "keypoints", "frame_offset", "fps")
     return replace(habit, **{n: getattr(found, n) for n in names if getattr(found, n) is not None})
 
@@ -105,20 +105,25 @@ def frame_names(times: np.ndarray, fps: float | None, where: Path | str) -> list
     numbers = np.rint(counted)
     if fps is None and (numbers != counted).any():
         raise InputError(
-            f"{where}: the time {times[numbers != counted][0]:g} is not a frame number; put the video's "
-            f'{{"fps": ...}} into {SIDECAR} beside it to count frames by time, or write frame numbers as times'
+            where,
+            f"the time {times[numbers != counted][0]:g} is not a frame number",
+            f'put the video\'s {{"fps": ...}} into {SIDECAR} beside it to count frames by time, or write frame numbers '
+            "as times",
         )
     if (numbers < 0).any() or (numbers > _MAX_FRAME).any():
         odd = times[(numbers < 0) | (numbers > _MAX_FRAME)][0]
         raise InputError(
-            f"{where}: the time {odd:g} falls on no frame; expected seconds since the first frame of the video "
-            f"(with fps in {SIDECAR}) or frame numbers, not the time of day and not nanoseconds"
+            where,
+            f"the time {odd:g} falls on no frame",
+            f"expected seconds since the first frame of the video (with fps in {SIDECAR}) or frame numbers, not the "
+            "time of day and not nanoseconds",
         )
     found, counts = np.unique(numbers, return_counts=True)
     if len(found) < len(numbers):
         raise InputError(
-            f"{where}: {counts.max()} keyframes fall on frame {found[counts.argmax()]:.0f}; "
-            f"is fps in {SIDECAR} too low?"
+            where,
+            f"{counts.max()} keyframes fall on frame {found[counts.argmax()]:.0f}",
+            f"is fps in {SIDECAR} too low?",
         )
     return [f"{number:06.0f}.png" for number in numbers]
 

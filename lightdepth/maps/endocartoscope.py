@@ -64,7 +64,7 @@ def read_trajectory(path: Path) -> list[TrajectoryPose]:
             continue
         where, tokens = f"{path}, line {number}", [t.strip() for t in line.split(",")]
         if len(tokens) < 9:
-            raise InputError(f"{where}: {len(tokens)} columns between commas; expected {expected}")
+            raise InputError(where, f"{len(tokens)} columns between commas", f"expected {expected}")
         numbers = parse_numbers([tokens[0], *tokens[2:9]], where, expected)
         if not np.isfinite(numbers).all():
             continue
@@ -82,16 +82,16 @@ def read_exported_submap(folder: Path, map_id: int, convention: MapConvention) -
     for part in ("cameras.txt", "points3D.txt"):
         if not (folder / part).is_file():
             raise InputError(
-                f"{folder}: {part} missing; with a trajectory alone a map needs cameras.txt and points3D.txt"
+                folder, f"{part} missing", "with a trajectory alone a map needs cameras.txt and points3D.txt"
             )
     cameras = read_cameras_text(folder / "cameras.txt")
     if len(cameras) != 1:
         raise InputError(
-            f"{folder / 'cameras.txt'}: {len(cameras)} cameras; without images.txt there must be exactly one"
+            f"{folder / 'cameras.txt'}", f"{len(cameras)} cameras", "without images.txt there must be exactly one"
         )
     poses = [p for p in read_trajectory(trajectory) if p.is_keyframe]
     if not poses:
-        raise InputError(f"{trajectory}: no keyframe in it (column frame_state 1); expected at least one")
+        raise InputError(trajectory, "no keyframe in it (column frame_state 1)", "expected at least one")
     (camera,) = cameras.values()
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     keyframes = [convention.keyframe(p.name, camera, p.cam_from_map, *none) for p in poses]

@@ -9,7 +9,15 @@ from lightdepth.maps.colmap import holds_model, read_submap
 from lightdepth.maps.convention import COLMAP, EXPORTER, declared_convention
 from lightdepth.maps.endocartoscope import MAPS, read_exported_submap
 from lightdepth.maps.stella import read_stella
-from lightdepth.maps.tum import WITHOUT_POINTS, first_entry, holds_points, holds_trajectory, is_trajectory, read_tum_map
+from lightdepth.maps.tum import (
+    POINTS_NEEDED,
+    WITHOUT_POINTS,
+    first_entry,
+    holds_points,
+    holds_trajectory,
+    is_trajectory,
+    read_tum_map,
+)
 from lightdepth.sparse_map import SparseMap
 
 _ACCEPTED = (
@@ -31,16 +39,20 @@ def read_map(path: Path | str) -> SparseMap:
     try:
         return _read_map(path)
     except OSError as error:
-        raise InputError(f"{error.filename or path}: cannot be read ({error.strerror or error})") from error
+        raise InputError(
+            error.filename or path,
+            f"cannot be read ({error.strerror or error})",
+            "expected files that are there and may be read",
+        ) from error
 
 
 def _read_map(path: Path) -> SparseMap:
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder; {_ACCEPTED}")
+        raise InputError(path, "no such file or folder", _ACCEPTED)
     if path.is_file() and path.suffix.lower() in (".msg", ".json"):
         return SparseMap((read_stella(path),), str(path))
     if not path.is_dir():
-        raise InputError(_why_not_file(path))
+        raise _why_not_file(path)
     tree = _multimap_tree(path)
     if tree is not None:
         return _read_tree(tree, path)
@@ -62,10 +74,10 @@ def _read_map(path: Path) -> SparseMap:
     messages = sorted(path.glob("*.msg"))
     if len(messages) > 1:
         found = ", ".join(m.name for m in messages)
-        raise InputError(f"{path}: several stella_vslam maps ({found}); give one of them, e.g. {messages[0]}")
+        raise InputError(path, f"several stella_vslam maps ({found})", f"give one of them, e.g. {messages[0]}")
     if messages:
         return SparseMap((read_stella(messages[0]),), str(path))
-    raise InputError(_why_not_folder(path))
+    raise _why_not_folder(path)
 
 
 def _multimap_tree(path: Path) -> Path | None:
@@ -78,7 +90,7 @@ def _multimap_tree(path: Path) -> Path | None:
     if len(trees) > 1:
         found = ", ".join(t.parent.name for t in trees)
         raise InputError(
-            f"{path}: several runs with a {MAPS} folder ({found}); give one of them, e.g. {trees[0].parent}"
+            path, f"several runs with a {MAPS} folder ({found})", f"give one of them, e.g. {trees[0].parent}"
         )
     return trees[0] if trees else None
 
@@ -86,7 +98,7 @@ def _multimap_tree(path: Path) -> Path | None:
 def _read_tree(tree: Path, source: Path) -> SparseMap:
     folders = _numbered(tree)
     if not folders:
-        raise InputError(f"{tree}: no map in it; expected a folder for each map named by its number, {MAPS}/0")
+        raise InputError(tree, "no map in it", f"expected a folder for each map named by its number, {MAPS}/0")
     roots = (tree, tree.resolve().parent)
     submaps = []
     for map_id, folder in folders.items():
@@ -108,36 +120,37 @@ def _numbered(root: Path) -> dict[int, Path]:
         twin = folders.setdefault(int(folder.name), folder)
         if twin is not folder:
             raise InputError(
-                f"{root}: {twin.name} and {folder.name} are both map {int(folder.name)}; rename one of them"
+                root, f"{twin.name} and {folder.name} are both map {int(folder.name)}", "rename one of them"
             )
     return dict(sorted(folders.items()))
 
 
-def _why_not_file(path: Path) -> str:
+def _why_not_file(path: Path) -> InputError:
     if path.suffix == ".osa":
-        return (
-            f"{path}: an ORB-SLAM3 atlas, which only the build that wrote it can read; "
-            f"export the multi-map tree instead ({MAPS}/<id>/ with cameras.txt, images.txt, points3D.txt)"
+        return InputError(
+            path,
+            "an ORB-SLAM3 atlas, which only the build that wrote it can read",
+            f"export the multi-map tree instead ({MAPS}/<id>/ with cameras.txt, images.txt, points3D.txt)",
         )
     if path.suffix == ".db":
-        return f"{path}: a data base; if it is stella_vslam's, save the map as .msg instead"
+        return InputError(path, "a data base", "if it is stella_vslam's, save the map as .msg instead")
     if path.stem in ("cameras", "images", "points3D"):
-        return f"{path}: one file of a COLMAP model; give the folder it is in, {path.parent}"
+        return InputError(path, "one file of a COLMAP model", f"give the folder it is in, {path.parent}")
     if is_trajectory(path) and holds_points(path.parent):
-        return f"{path}: one file of a map; give the folder it is in, {path.parent}"
+        return InputError(path, "one file of a map", f"give the folder it is in, {path.parent}")
     if _is_trajectory(path):
-        return f"{path}: {WITHOUT_POINTS}"
-    return f"{path}: a file of no known map format; {_ACCEPTED}"
+        return InputError(path, WITHOUT_POINTS, POINTS_NEEDED)
+    return InputError(path, "a file of no known map format", _ACCEPTED)
 
 
-def _why_not_folder(path: Path) -> str:
+def _why_not_folder(path: Path) -> InputError:
     files = sorted(p for p in path.iterdir() if p.is_file())
     for file in files:
         if file.suffix == ".osa" or (file.suffix in (".txt", ".tum") and _is_trajectory(file)):
             return _why_not_file(file)
     names = sorted(p.name for p in path.iterdir())
     found = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-    return f"{path}: no map in it (found {found or 'nothing: the folder is empty'}); {_ACCEPTED}"
+    return InputError(path, f"no map in it (found {found or 'nothing: the folder is empty'})", _ACCEPTED)
 
 
 def _is_trajectory(path: Path) -> bool:

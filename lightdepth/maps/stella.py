@@ -49,7 +49,7 @@ def read_stella(path: Path) -> Submap:
         ids.append(_integer(key, where))
         points.append(_numbers(_record(entry, where), "pos_w", 3, where))
     if not points:
-        raise InputError(f"{path}: landmarks: no points in it; an empty map cannot be densified")
+        raise InputError(path, "landmarks: no points in it", "an empty map cannot be densified, leave it out")
     return assembled(path, 0, keyframes, np.array(ids, np.int64), np.array(points).reshape(-1, 3))
 
 
@@ -60,31 +60,33 @@ def _content(path: Path) -> Mapping[str, Any]:
         try:
             content = msgpack.unpackb(path.read_bytes(), strict_map_key=False)
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+            raise InputError(
+                path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
+            ) from error
         except (ValueError, msgpack.exceptions.UnpackException) as error:
             raise InputError(
-                f"{path}: not msgpack, or copied incompletely ({error or type(error).__name__})"
+                path, f"not msgpack, or copied incompletely ({error or type(error).__name__})", "copy it again"
             ) from error
     if not isinstance(content, dict):
-        raise InputError(f"{path}: found {type(content).__name__}; expected a map with cameras, keyframes, landmarks")
+        raise InputError(path, f"found {type(content).__name__}", "expected a map with cameras, keyframes, landmarks")
     return content
 
 
 def _section(content: Mapping[str, Any], name: str, path: Path) -> Mapping[Any, Any]:
     if name not in content:
-        raise InputError(f"{path}: {name} missing; expected a stella_vslam map with cameras, keyframes, landmarks")
+        raise InputError(path, f"{name} missing", "expected a stella_vslam map with cameras, keyframes, landmarks")
     return _record(content[name], f"{path}: {name}")
 
 
 def _record(value: Any, where: str) -> Mapping[Any, Any]:
     if not isinstance(value, dict):
-        raise InputError(f"{where}: found {type(value).__name__}; expected fields by name")
+        raise InputError(where, f"found {type(value).__name__}", "expected fields by name")
     return value
 
 
 def _field(entry: Mapping[Any, Any], name: str, where: str) -> Any:
     if name not in entry:
-        raise InputError(f"{where}.{name}: missing")
+        raise InputError(f"{where}.{name}", "missing", "expected the fields that stella_vslam writes")
     return entry[name]
 
 
@@ -92,9 +94,9 @@ def _integer(value: Any, where: str) -> int:
     try:
         number = int(value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{where}: found {value!r}; expected an integer") from None
+        raise InputError(where, f"found {value!r}", "expected an integer") from None
     if abs(number) >= 2**63:
-        raise InputError(f"{where}: found {number}; expected an integer below 2^63")
+        raise InputError(where, f"found {number}", "expected an integer below 2^63")
     return number
 
 
@@ -106,7 +108,7 @@ def _numbers(entry: Mapping[Any, Any], name: str, count: int, where: str) -> np.
     except (TypeError, ValueError):
         numbers = np.zeros(0)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise InputError(f"{where}.{name}: found {str(value)[:60]}; expected {count} finite numbers")
+        raise InputError(f"{where}.{name}", f"found {str(value)[:60]}", f"expected {count} finite numbers")
     return numbers
 
 
@@ -123,11 +125,11 @@ def _keyframe(entry: Mapping[Any, Any], where: str, cameras: _Cameras) -> Keyfra
     landmarks = _field(entry, "lm_ids", where)
     if not isinstance(landmarks, list) or len(landmarks) != len(pixels):
         found = len(landmarks) if isinstance(landmarks, list) else type(landmarks).__name__
-        raise InputError(f"{where}.lm_ids: found {found}; expected one for each of the {len(pixels)} {name}")
+        raise InputError(f"{where}.lm_ids", f"found {found}", f"expected one for each of the {len(pixels)} {name}")
     ids = np.array([_integer(i, f"{where}.lm_ids") for i in landmarks], np.int64)
     held = ids >= 0
     if not np.isfinite(pixels[held]).all():
-        raise InputError(f"{where}.{name}: NaN or infinite keypoints; expected pixels")
+        raise InputError(f"{where}.{name}", "NaN or infinite keypoints", "expected pixels")
     camera = cameras.named(str(_field(entry, "cam", where)))
     return convention.keyframe(_name(entry, where, convention), camera, pose, pixels[held], ids[held])
 
@@ -136,7 +138,7 @@ def _name(entry: Mapping[Any, Any], where: str, convention: MapConvention) -> st
     if "src_frm_id" in entry:
         return f"{_integer(entry['src_frm_id'], f'{where}.src_frm_id'):06d}.png"
     if convention.fps is None:
-        raise InputError(f"{where}.src_frm_id: missing; put fps into densify_map.json to count frames by ts")
+        raise InputError(f"{where}.src_frm_id", "missing", "put fps into densify_map.json to count frames by ts")
     return frame_names(_numbers({"ts": [_field(entry, "ts", where)]}, "ts", 1, where), convention.fps, f"{where}.ts")[0]
 
 
@@ -144,12 +146,14 @@ def _keypoints(entry: Mapping[Any, Any], where: str) -> tuple[np.ndarray, str]:
     """Pixels (n, 2), and the field they came from."""
     name = next((n for n in ("keypts", "undists", "undist_keypts") if n in entry), None)
     if name is None:
-        raise InputError(f"{where}: no keypts and no undists; expected one of them, a pixel for each of lm_ids")
+        raise InputError(where, "no keypts and no undists", "expected one of them, a pixel for each of lm_ids")
     try:
         points = [p["pt"] if isinstance(p, dict) else p for p in entry[name]]
         return np.array(points, np.float64).reshape(len(points), 2), name
     except (KeyError, TypeError, ValueError):
-        raise InputError(f"{where}.{name}: expected [u, v], or {{pt: [u, v]}}, for each keypoint") from None
+        raise InputError(
+            f"{where}.{name}", "not pixels", "expected [u, v], or {pt: [u, v]}, for each keypoint"
+        ) from None
 
 
 # ---- cameras
@@ -175,7 +179,9 @@ class _Cameras:
         except InputError as error:
             beside = self.path.parent / "camera.json"
             if not beside.is_file():
-                raise InputError(f"{error}; correct it, or put camera.json beside the map") from error
+                raise InputError(
+                    error.where, error.found, f"{error.cure}. Correct it, or put camera.json beside the map"
+                ) from error
             return self.convention.from_ours(read_camera(beside))
 
 
@@ -183,14 +189,14 @@ def _camera(entry: Mapping[Any, Any], where: str) -> CameraModel:
     """In the file's own pixels. Raises InputError for a lens that is not ours, and for a field that is missing."""
     model = str(_field(entry, "model_type", where))
     if model not in _LENSES:
-        raise InputError(f"{where}.model_type: found {model!r}; expected {' or '.join(_LENSES)}")
+        raise InputError(f"{where}.model_type", f"found {model!r}", f"expected {' or '.join(_LENSES)}")
     name, terms = _LENSES[model]
 
     def number(field: str) -> float:
         return float(_numbers({field: [_field(entry, field, where)]}, field, 1, where)[0])
 
     if model == "Perspective" and "k3" in entry and number("k3") != 0:
-        raise InputError(f"{where}.k3: found {entry['k3']}; expected 0, the lens model has no third radial term")
+        raise InputError(f"{where}.k3", f"found {entry['k3']}", "expected 0, the lens model has no third radial term")
     size = (int(number("cols")), int(number("rows")))
     focal = [number(field) for field in ("fx", "fy", "cx", "cy")]
     bent = [number(field) for field in terms]
@@ -199,7 +205,7 @@ def _camera(entry: Mapping[Any, Any], where: str) -> CameraModel:
             return KannalaBrandt(*size, *focal, *bent)
         return Brown(*size, *focal, *bent) if any(bent) else Pinhole(*size, *focal)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise error.within(where) from error
 
 
 # ---- writing
@@ -243,7 +249,7 @@ def _keyframe_fields(keyframe: Keyframe, camera: str) -> dict[str, Any]:
 def _camera_fields(camera: CameraModel) -> dict[str, Any]:
     models: dict[type, str] = {Pinhole: "Perspective", Brown: "Perspective", KannalaBrandt: "Fisheye"}
     if type(camera) not in models:
-        raise InputError(f"{camera.name} camera: stella_vslam has no such lens; expected {' or '.join(_LENSES)}")
+        raise InputError(f"{camera.name} camera", "stella_vslam has no such lens", f"expected {' or '.join(_LENSES)}")
     model = models[type(camera)]
     params = camera.with_pixel_center(1.0).params  # moves the origin by -0.5: ours to OpenCV's
     terms = dict.fromkeys(_LENSES[model][1], 0.0) | dict(zip(_LENSES[model][1], params[4:], strict=False))

@@ -28,10 +28,11 @@ from lightdepth.maps.convention import EXPORTER, MapConvention, declared_convent
 from lightdepth.sparse_map import Submap
 
 TUM = replace(EXPORTER, pose_convention="c2w")
-WITHOUT_POINTS = (
-    "a trajectory without points; a dense map needs the map's points and which keyframe saw them: give a COLMAP model "
-    "or the multi-map tree (3D_maps/<id>/), or put points3D.txt, a PLY or a file of `x y z` lines, and camera.json, "
-    "beside the trajectory. Or leave the map out and let `sparse` make one"
+WITHOUT_POINTS = "a trajectory without points"
+POINTS_NEEDED = (
+    "a dense map needs the map's points and which keyframe saw them: give a COLMAP model or the multi-map tree "
+    "(3D_maps/<id>/), or put points3D.txt, a PLY or a file of `x y z` lines, and camera.json, beside the trajectory. "
+    "Or leave the map out and let `sparse` make one"
 )
 _KEYFRAMES = "KeyFrameTrajectory.txt"
 _OTHERS = ("cameras.txt", "images.txt", "points3D.txt", "intrinsics.txt")  # numbers in columns too, but not ours
@@ -56,7 +57,7 @@ def read_tum_map(folder: Path) -> Submap:
     trajectory = _only(_trajectories(folder), folder, "trajectories", f"name the one of the keyframes {_KEYFRAMES}")
     clouds = _clouds(folder)
     if not clouds:
-        raise InputError(f"{trajectory}: {WITHOUT_POINTS}")
+        raise InputError(trajectory, WITHOUT_POINTS, POINTS_NEEDED)
     cloud = _only(clouds, folder, "point clouds", "leave one")
     convention = declared_convention(folder, 0, TUM)
     camera = _camera(folder, convention)
@@ -71,7 +72,7 @@ def _guessed(submap: Submap, where: Path) -> Submap:
     try:
         submap = seen_by_projection(submap, hide=True)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise error.within(where) from error
     warnings.warn(
         f"{where}: a trajectory and a point cloud do not say which keyframe observed which point; taken to be every "
         "point in its view that no nearer one hides. Alignment will be weaker: export the keypoints with their point "
@@ -83,7 +84,7 @@ def _guessed(submap: Submap, where: Path) -> Submap:
 
 def _only(paths: list[Path], folder: Path, what: str, cure: str) -> Path:
     if len(paths) > 1:
-        raise InputError(f"{folder}: several {what} ({', '.join(p.name for p in paths)}); {cure}")
+        raise InputError(folder, f"several {what} ({', '.join(p.name for p in paths)})", cure)
     return paths[0]
 
 
@@ -132,10 +133,10 @@ def _camera(folder: Path, convention: MapConvention) -> CameraModel:
         return convention.from_ours(read_camera(folder / "camera.json"))
     path = folder / "cameras.txt"
     if not path.is_file():
-        raise InputError(f"{folder}: no camera; a trajectory with points needs camera.json or cameras.txt beside them")
+        raise InputError(folder, "no camera", "a trajectory with points needs camera.json or cameras.txt beside them")
     cameras = list(read_cameras_text(path).values())
     if len(cameras) != 1:
-        raise InputError(f"{path}: {len(cameras)} cameras; a trajectory does not say whose it is, expected exactly one")
+        raise InputError(path, f"{len(cameras)} cameras", "a trajectory does not say whose it is, expected exactly one")
     return cameras[0]
 
 
@@ -157,9 +158,11 @@ def _read_ply(path: Path) -> np.ndarray:
         vertices = getattr(trimesh.load(path, process=False), "vertices", None)
         points = np.array([] if vertices is None else vertices, np.float64).reshape(-1, 3)
     except Exception as error:  # whatever a broken header makes the reader stumble over
-        raise InputError(f"{path}: not a PLY that can be read ({type(error).__name__}: {error})") from error
+        raise InputError(
+            path, f"not a PLY that can be read ({type(error).__name__}: {error})", "expected a PLY with vertices x y z"
+        ) from error
     if not len(points):
-        raise InputError(f"{path}: no points in it; expected a PLY with vertices x y z")
+        raise InputError(path, "no points in it", "expected a PLY with vertices x y z")
     return points
 
 
@@ -170,6 +173,6 @@ def _read_xyz(path: Path) -> np.ndarray:
             continue
         where, words = f"{path}, line {number}", line.split()
         if len(words) != 3:
-            raise InputError(f"{where}: {len(words)} columns; expected x y z")
+            raise InputError(where, f"{len(words)} columns", "expected x y z")
         points.append(parse_numbers(words, where, "x y z"))
     return np.array(points).reshape(-1, 3)

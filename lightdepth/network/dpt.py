@@ -43,7 +43,7 @@ class DPT(nn.Module):
             from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
         except ImportError as error:
             raise InputError(
-                f"network kind 'dpt' needs transformers: pip install 'lightdepth[dpt]' ({error})"
+                "network kind 'dpt'", f"it needs transformers ({error})", "install it: pip install 'lightdepth[dpt]'"
             ) from error
         size = ENCODERS[encoder]
         backbone = Dinov2Config(

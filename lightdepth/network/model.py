@@ -61,7 +61,7 @@ class NetworkConfig:
         object.__setattr__(self, "inputs", tuple(self.inputs))  # JSON has lists
         unknown = [name for name in self.inputs if name not in CHANNELS]
         if unknown or not self.inputs:
-            raise InputError(f"network inputs {list(self.inputs)}; expected some of {', '.join(CHANNELS)}")
+            raise InputError("network inputs", f"{list(self.inputs)}", f"expected some of {', '.join(CHANNELS)}")
         choices: tuple[tuple[str, str, tuple[str, ...]], ...] = (
             ("kind", self.kind, KINDS),
             ("output", self.output, OUTPUTS),
@@ -69,14 +69,14 @@ class NetworkConfig:
         )
         for what, value, allowed in choices:
             if value not in allowed:
-                raise InputError(f"network {what} {value!r}; expected one of {', '.join(allowed)}")
+                raise InputError(f"network {what}", f"{value!r} is not known", f"expected one of {', '.join(allowed)}")
         if self.encoder is None:
             object.__setattr__(self, "encoder", _DEFAULT_ENCODER.get(self.kind))
         elif self.encoder not in ENCODERS[self.kind]:
             known = ", ".join(ENCODERS[self.kind]) or "none"
-            raise InputError(f"network encoder {self.encoder!r} of {self.kind}; expected {known}")
+            raise InputError("network encoder", f"{self.encoder!r} of {self.kind} is not known", f"expected {known}")
         if self.width < 1 or self.blur < 0:
-            raise InputError(f"network width {self.width}, blur {self.blur}; expected width > 0 and blur >= 0")
+            raise InputError("network", f"width {self.width}, blur {self.blur}", "expected width > 0 and blur >= 0")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON and for checkpoints that load without pickle."""
@@ -88,7 +88,9 @@ class NetworkConfig:
         try:
             return cls(**values)
         except TypeError as error:
-            raise InputError(f"network configuration {values}: {error}") from error
+            raise InputError(
+                "network configuration", f"{values}: {error}", "was it written by another version of the program?"
+            ) from error
 
 
 class Estimate(NamedTuple):

@@ -40,9 +40,9 @@ def load_pretrained(network: DepthNetwork, path: Path | str) -> None:
     """
     path, kind = Path(path), network.config.kind
     if kind == "tiny":
-        raise InputError(f"{path}: the tiny network takes no pretrained encoder; expected network kind unet or dpt")
+        raise InputError(path, "the tiny network takes no pretrained encoder", "expected network kind unet or dpt")
     if "rgb" not in network.config.inputs:
-        raise InputError(f"{path}: pretrained weights see colours; expected rgb among the network's inputs")
+        raise InputError(path, "pretrained weights see colours", "expected rgb among the network's inputs")
     target: nn.Module = network.body
     stem = dpt.STEM
     optional: tuple[str, ...] = ()
@@ -67,14 +67,18 @@ def load_pretrained(network: DepthNetwork, path: Path | str) -> None:
         problems.sort()
         shown = "; ".join(problems[:_SHOWN])
         more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
-        raise InputError(f"{path}: does not fit {kind} with {network.config.encoder}: {shown}{more}")
+        raise InputError(
+            path,
+            f"does not fit {kind} with {network.config.encoder}: {shown}{more}",
+            "give the weights of this encoder",
+        )
     target.load_state_dict(given, strict=False)
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
     """A state dict from .safetensors, or from .pth / .pt without executing anything, in float32. Raises InputError."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected weights as .safetensors or .pth")
+        raise InputError(path, "no such file", "expected weights as .safetensors or .pth")
     state: Any
     try:
         if path.suffix == ".safetensors":
@@ -82,16 +86,18 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         elif path.suffix in (".pth", ".pt"):
             state = torch.load(path, map_location="cpu", weights_only=True)
         else:
-            raise InputError(f"{path}: unknown kind of weights; expected a name that ends in .safetensors or .pth")
+            raise InputError(path, "unknown kind of weights", "expected a name that ends in .safetensors or .pth")
     except InputError:
         raise
     except (SafetensorError, Exception) as error:  # a damaged or hostile pickle can raise anything
         first = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise InputError(f"{path}: damaged, or holds more than weights ({first})") from error
+        raise InputError(
+            path, f"damaged, or holds more than weights ({first})", "expected a state dict as .safetensors or .pth"
+        ) from error
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         state = state["state_dict"]
     if not isinstance(state, dict) or not state or not all(isinstance(v, Tensor) for v in state.values()):
-        raise InputError(f"{path}: not a state dict; expected names and tensors")
+        raise InputError(path, "not a state dict", "expected names and tensors")
     return {name: value.float() if value.is_floating_point() else value for name, value in state.items()}
 
 

@@ -83,19 +83,23 @@ def run_folder(output: Path, verb: str, arguments: Mapping[str, Any], overwrite:
     """A Run whose folder becomes `output` when the block ends well. Raises InputError when `output` is in use."""
     output = Path(output)
     if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; expected a folder to make")
+        raise InputError(output, "is a file", "expected a folder to make")
     if output.is_dir() and any(output.iterdir()):
         if not overwrite:
-            raise InputError(f"{output}: already there and not empty; choose another -o, or give --overwrite")
+            raise InputError(output, "already there and not empty", "choose another -o, or give --overwrite")
         if not (output / "run.json").is_file():
-            raise InputError(f"{output}: not overwritten, it has no run.json and so was not made by this program")
+            raise InputError(
+                output,
+                "not overwritten, it has no run.json and so was not made by this program",
+                "choose another -o, or remove it yourself",
+            )
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         # Beside the target, so that the finished folder arrives by a rename; a name of its own: nothing is in its way.
         staging = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
         staging.chmod(0o755)
     except OSError as error:
-        raise InputError(f"{output}: cannot be made ({error.strerror})") from error
+        raise InputError(output, f"cannot be made ({error.strerror})", "choose another -o") from error
     run = Run(staging, verb, arguments)
     try:
         yield run

@@ -10,7 +10,7 @@ Progress = Callable[[str, int, int], None]
 """Called with the stage ("images", "features", "matches", "mapping"), how much of it is done, and of how much."""
 
 ADVICE = (
-    "What helps: more frames; at least 5 mm of travel with some of it sideways (pure forward motion over 3 mm fails); "
+    "what helps: more frames; at least 5 mm of travel with some of it sideways (pure forward motion over 3 mm fails); "
     "sharp frames (blurred ones have no features); the calibration of this very image size; "
     "a mask that leaves the tissue free. A lower `peak_threshold` finds more features in smooth tissue"
 )

@@ -51,11 +51,13 @@ def write_images(frames: Sequence[Frame], images: Path, masks: Path, config: Sfm
         first = first or frame
         if frame.camera != first.camera:
             raise InputError(
-                f"{frame.name}: another camera than {first.name}'s; map the frames of one camera at a time"
+                frame.name, f"another camera than {first.name}'s", "map the frames of one camera at a time"
             )
         name = frame_file(frame.name)
         if name in names:
-            raise InputError(f"{frame.name} and {names[name]} are both frame {frame.number}; numbers must be unique")
+            raise InputError(
+                frame.name, f"it and {names[name]} are both frame {frame.number}", "numbers must be unique"
+            )
         names[name] = frame.name
         image = np.rint(255 * np.clip(frame.image, 0, 1)).astype(np.uint8)
         meter = Meter(frame.valid) if meter is None else meter
@@ -65,10 +67,12 @@ def write_images(frames: Sequence[Frame], images: Path, masks: Path, config: Sfm
             (masks, f"{name}.png", 255 * usable_pixels(frame, config).astype(np.uint8)),
         ):
             if not cv2.imwrite(str(folder / file), pixels):
-                raise InputError(f"{folder / file}: cannot be written; is the disk full?")
+                raise InputError(f"{folder / file}", "cannot be written", "is the disk full?")
         progress("images", done, len(frames))
     if first is None or meter is None or len(names) < config.min_model_size:
-        raise InputError(f"{len(names)} frames; a sparse map needs at least {config.min_model_size}. {ADVICE}")
+        raise InputError(
+            "the frames", f"{len(names)} of them; a sparse map needs at least {config.min_model_size}", ADVICE
+        )
     order, found = np.argsort(list(names)), meter.result()
     measures = Measures(*(getattr(found, f.name)[order] for f in fields(Measures)))
     return Written(first.camera, first.valid, names, measures)

@@ -88,9 +88,9 @@ def sparse_map_from_frames(
             failed = {n: r if frame_file(n) in known else "it has no known pose" for n, r in failed.items()}
         if not count:
             raise InputError(
-                f"no sparse map could be made of {len(frames)} frames of {written.camera.width}x"
-                f"{written.camera.height}: COLMAP connected no {config.min_model_size} of them by "
-                f"{config.min_points} points ({summary(why)}). {ADVICE}"
+                f"no sparse map of {len(frames)} frames of {written.camera.width}x{written.camera.height} could be made",
+                f"COLMAP connected no {config.min_model_size} of them by {config.min_points} points ({summary(why)})",
+                ADVICE,
             )
         _move_models(models, out_folder)
     if failed:
@@ -112,7 +112,9 @@ def _known_poses(
             check_rigid(pose, f"pose of frame {frame_number(name)}")
             known[name] = turn @ np.linalg.inv(pose)
     if len(known) < 2:
-        raise InputError(f"{len(known)} of {len(names)} frames have a known pose; triangulation needs at least 2")
+        raise InputError(
+            "known poses", f"{len(known)} of {len(names)} frames have one", "triangulation needs at least 2"
+        )
     return known
 
 
@@ -220,10 +222,10 @@ def _with_camera(submap: Submap, camera: CameraModel, rotation: np.ndarray) -> S
 
 def _check_free(out_folder: Path) -> None:
     if out_folder.exists() and not out_folder.is_dir():
-        raise InputError(f"{out_folder}: a file; expected a folder to write the map to")
+        raise InputError(out_folder, "a file", "expected a folder to write the map to")
     taken = [p for p in out_folder.glob("*") if p.name.isdigit()] if out_folder.is_dir() else []
     if taken or (out_folder.is_dir() and holds_model(out_folder)):
-        raise InputError(f"{out_folder}: holds a map already; remove it, or use it as the map (--map {out_folder})")
+        raise InputError(out_folder, "holds a map already", f"remove it, or use it as the map (--map {out_folder})")
 
 
 def _move_models(models: Path, out_folder: Path) -> None:

@@ -42,9 +42,9 @@ def rendering_device(wanted: str = "auto") -> torch.device:
     if wanted == "auto":
         wanted = "cuda" if torch.cuda.is_available() and native.has_warp() else "cpu"
     if wanted not in ("cpu", "cuda"):
-        raise InputError(f"device {wanted!r} to render on; expected auto, cpu or cuda")
+        raise InputError("device to render on", f"{wanted!r} is not known", "expected auto, cpu or cuda")
     if wanted == "cuda" and not torch.cuda.is_available():
-        raise InputError("device cuda to render on: PyTorch finds no GPU; take cpu, or auto")
+        raise InputError("device to render on", "cuda, but PyTorch finds no GPU", "take cpu, or auto")
     return torch.device("cpu") if wanted == "cpu" else torch.device("cuda", torch.cuda.current_device())
 
 

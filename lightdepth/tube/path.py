@@ -45,7 +45,7 @@ def lens(kind: str, width: int, height: int) -> CameraModel:
         return KannalaBrandt(width, height, f, f, *centre, -0.13, -0.005, 0.0015, -0.0001)
     if kind == "c3vd":
         return C3VD.resized(width, height)
-    raise InputError(f"lens {kind!r}; expected pinhole, telescope, fisheye or c3vd")
+    raise InputError("lens", f"{kind!r} is not known", "expected pinhole, telescope, fisheye or c3vd")
 
 
 def octagon(camera: CameraModel, cut: float = 0.2) -> np.ndarray:

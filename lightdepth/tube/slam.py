@@ -60,7 +60,9 @@ def simulate_slam(frames: Sequence[Frame], config: SlamConfig, seed: int) -> Sim
     rng = np.random.default_rng([seed, 1])
     keyframes = list(frames)[:: config.keyframe_every]
     if len(keyframes) < 2 * config.maps:
-        raise InputError(f"{len(keyframes)} keyframes cannot be shared among {config.maps} maps; render more frames")
+        raise InputError(
+            f"{config.maps} maps", f"{len(keyframes)} keyframes cannot be shared among them", "render more frames"
+        )
     submaps, sims, wrong = [], {}, {}
     for map_id, part in enumerate(_parts(len(keyframes), config.maps, config.shared_keyframes)):
         submap, sims[map_id], wrong[map_id] = _submap(map_id, [keyframes[i] for i in part], config, rng)
@@ -88,7 +90,9 @@ def _submap(
     keep = seen.sum(0) >= min(3, len(frames))
     world, made_by, seen = world[keep], made_by[keep], seen[:, keep]
     if not len(world):
-        raise InputError("no point is seen by enough keyframes; use a shorter travel or more frames")
+        raise InputError(
+            "the simulated map", "no point is seen by enough keyframes", "use a shorter travel or more frames"
+        )
 
     pixels = [_project(frame, world) + rng.normal(0, config.pixel_noise, (len(world), 2)) for frame in frames]
     centers = np.stack([_pose(frame)[:3, 3] for frame in frames])[made_by]
@@ -119,7 +123,9 @@ def _submap(
 
 def _pose(frame: Frame) -> np.ndarray:
     if frame.true_world_from_cam is None or frame.true_distance is None:
-        raise InputError(f"{frame.name}: a SLAM can only be simulated on frames with true distance and pose")
+        raise InputError(
+            frame.name, "no true distance or no true pose", "a SLAM can only be simulated on frames with both"
+        )
     return frame.true_world_from_cam
 
 

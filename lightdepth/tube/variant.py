@@ -44,7 +44,7 @@ def variant_frames(
     that of cos^k near the axis, and the response's power at mid grey. Raises InputError for another strength.
     """
     if strength not in REFLECTANCE:
-        raise InputError(f"strength {strength!r}; expected weak or strong")
+        raise InputError("strength", f"{strength!r} is not known", "expected weak or strong")
     config = TubeConfig(sensor=SensorConfig(reflectance=REFLECTANCE[strength]), least_cosine=0.05)
     frames = render_sequence(seed, count, camera, travel, config, kind=VariantTube).frames
     return [replace(frame, name=f"variant{seed}_{frame.name}") for frame in frames]

@@ -40,18 +40,24 @@ class Plan:
 def check(output: Path, rows: Sequence[Row], judged: Sequence[JudgedColons], seeds: Sequence[int]) -> None:
     """Raises InputError where there is nothing to train or to judge on, or two things have one name."""
     if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; expected a folder to write the run to")
+        raise InputError(output, "is a file", "expected a folder to write the run to")
     for what, given in (("rows", rows), ("judged colons", judged), ("seeds", seeds)):
         if not given:
-            raise InputError(f"ablate: no {what}; give --config configs/ablation/lightdepth.yaml or one of your own")
+            raise InputError(
+                "ablate", f"no {what}", "give --config configs/ablation/lightdepth.yaml or one of your own"
+            )
     for what, names in (("rows", [row.file for row in rows]), ("judged colons", [colons.name for colons in judged])):
         twice = sorted({name for name in names if names.count(name) > 1 or not name})
         if twice:
             raise InputError(
-                f"ablate: {what} {', '.join(map(repr, twice))} twice or empty; every one needs its own name"
+                "ablate", f"{what} {', '.join(map(repr, twice))} twice or empty", "every one needs its own name"
             )
     if rows[0].seeds is not None or len(rows[0].told) != 1:
-        raise InputError(f"row {rows[0].name!r}: the first is what all are compared with: no seeds or told of its own")
+        raise InputError(
+            f"row {rows[0].name!r}",
+            "seeds or told of its own, though all are compared with this first row",
+            "leave them out",
+        )
 
 
 def check_apart(tube: TubeData, judged: Sequence[JudgedColons], seeds: Sequence[int]) -> None:
@@ -61,7 +67,11 @@ def check_apart(tube: TubeData, judged: Sequence[JudgedColons], seeds: Sequence[
             for colons in judged:
                 both = range(max(trained.start, colons.first), min(trained.stop, colons.seeds.stop))
                 if both:
-                    raise InputError(f"judged colons {colons.name!r}: {both[0]} is trained on with seed {seed}")
+                    raise InputError(
+                        f"judged colons {colons.name!r}",
+                        f"{both[0]} is trained on with seed {seed}",
+                        "choose others to judge on",
+                    )
 
 
 def plans_of(
@@ -82,7 +92,7 @@ def plans_of(
             values["model"] = _read(shipped(row.preset)).get("model", {})
         for dotted, value in {**common, **(row.settings or {})}.items():
             if isinstance(defaults.get(dotted), Namespace) and not isinstance(value, dict):
-                raise InputError(f"{where}: {dotted} is a group of options; give one of them, as {dotted}.NAME")
+                raise InputError(where, f"{dotted} is a group of options", f"give one of them, as {dotted}.NAME")
             _set(values, dotted, value, where)
         for seed in row.seeds or seeds:
             folder = output / f"seed_{seed}" / row.file
@@ -92,9 +102,9 @@ def plans_of(
                     parser.instantiate(config)
             except ArgumentError as error:
                 reason = " ".join(str(error).split())
-                raise InputError(f"{where}: {reason}; expected options of `lightdepth train`") from error
+                raise InputError(where, reason, "expected options of `lightdepth train`") from error
             except InputError as error:
-                raise InputError(f"{where}: {error}") from error
+                raise error.within(where) from error
             stamp = plain({"settings": as_yaml(parser, config), "told": row.told, "judged": judged})
             plans.append(Plan(row, seed, folder.with_suffix(".json"), config, stamp))
     plans.sort(key=lambda plan: (list(seeds) + [plan.seed]).index(plan.seed))  # a seed's colons are rendered once
@@ -105,9 +115,11 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         values = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: cannot be read as a training preset ({error})") from error
+        raise InputError(
+            path, f"cannot be read as a training preset ({error})", "expected a YAML like configs/train/*.yaml"
+        ) from error
     if not isinstance(values, dict):
-        raise InputError(f"{path}: not a training preset; expected a YAML like configs/train/*.yaml")
+        raise InputError(path, "not a training preset", "expected a YAML like configs/train/*.yaml")
     return values
 
 
@@ -117,5 +129,5 @@ def _set(values: dict[str, Any], dotted: str, value: Any, where: str) -> None:
     for group in groups:
         values = values.setdefault(group, {})
         if not isinstance(values, dict):
-            raise InputError(f"{where}: {dotted}: {group} is an option, not a group of them")
+            raise InputError(where, f"{dotted}: {group} is an option, not a group of them", "leave out what follows it")
     values[last] = copy.deepcopy(value)

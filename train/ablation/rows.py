@@ -63,7 +63,11 @@ class JudgedColons:
 
     def __post_init__(self) -> None:
         if min(self.count, self.frames) < 1 or self.first < 0:
-            raise InputError(f"judged colons {self.name!r}: expected count and frames above 0 and first of at least 0")
+            raise InputError(
+                f"judged colons {self.name!r}",
+                f"count {self.count}, frames {self.frames}, first {self.first}",
+                "expected count and frames above 0 and first of at least 0",
+            )
 
     @property
     def seeds(self) -> range:

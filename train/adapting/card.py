@@ -58,7 +58,11 @@ def target_loss(card: dict[str, Any], reflectance_known: bool, replayed: bool) -
     try:
         own = LossConfig(**card.get("loss", {}))
     except TypeError as error:
-        raise InputError(f"the checkpoint's card has a loss that is not known here ({error})") from error
+        raise InputError(
+            "the checkpoint's card",
+            f"it has a loss that is not known here ({error})",
+            "was it trained by another version of the program?",
+        ) from error
     reflectance = own.reflectance
     if reflectance is None and not reflectance_known:
         reflectance = default.reflectance

@@ -49,13 +49,15 @@ class AdaptConfig:
     def __post_init__(self) -> None:
         if min(self.steps, self.batch_size) < 1 or not self.learning_rate > 0 or self.replay < 0:
             raise InputError(
-                f"--steps {self.steps}, --batch-size {self.batch_size}, --learning-rate {self.learning_rate}, "
-                f"--replay {self.replay}; expected positive numbers, and 0 or more colons"
+                "--steps",
+                f"{self.steps}, --batch-size {self.batch_size}, --learning-rate {self.learning_rate}, --replay "
+                f"{self.replay}",
+                "expected positive numbers, and 0 or more colons",
             )
         if not (self.points >= 0 and self.overlap >= 0):
-            raise InputError(f"--points {self.points}, --overlap {self.overlap}; expected weights of 0 or more")
+            raise InputError("--points", f"{self.points}, --overlap {self.overlap}", "expected weights of 0 or more")
         if not 0 < self.held_out < 1:
-            raise InputError(f"--held-out {self.held_out}; expected a share above 0 and below 1")
+            raise InputError("--held-out", f"{self.held_out}", "expected a share above 0 and below 1")
 
     @property
     def taught(self) -> bool:

@@ -108,7 +108,7 @@ def parted(frames: FrameSequence, share: float) -> tuple[FrameSequence, FrameSeq
     """The frames to learn from, and those at the end that judge, as FrameDataModule parts them."""
     first = len(frames) - held_out_count(len(frames), share)
     if first < 1:
-        raise InputError(f"{frames.source}: {len(frames)} frame; expected at least two, one of them to judge by")
+        raise InputError(frames.source, f"{len(frames)} frame", "expected at least two, one of them to judge by")
     return frames[:first], frames[first:]
 
 

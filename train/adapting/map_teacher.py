@@ -71,8 +71,9 @@ class MapTeacher:
         self.keyframes = _taught(frames, sparse_map, set(withheld))
         if not self.keyframes:
             raise InputError(
-                f"{sparse_map.source}: no keyframe to learn from has {LEAST_POINTS} points that no withheld keyframe "
-                "saw; give more frames, or a smaller --held-out"
+                sparse_map.source,
+                f"no keyframe to learn from has {LEAST_POINTS} points that no withheld keyframe saw",
+                "give more frames, or a smaller --held-out",
             )
 
     def lesson(self, step: int) -> Lesson:

@@ -56,7 +56,9 @@ def let_learn(network: DepthNetwork, what: What, rank: int = 4, generator: torch
     low_rank: an addition of that rank to each convolution and linear layer, drawn from the generator.
     """
     if what not in WHAT or rank < 1:
-        raise InputError(f"what {what!r}, rank {rank}; expected one of {', '.join(WHAT)} and a rank of at least 1")
+        raise InputError(
+            "what, rank", f"{what!r}, {rank}", f"expected one of {', '.join(WHAT)} and a rank of at least 1"
+        )
     network.requires_grad_(False)
     if what == "all":
         network.body.requires_grad_(True)
@@ -110,7 +112,7 @@ class Adaptation(LightDepth):
     ) -> None:
         super().__init__(start.network.config, loss, learning_rate, weight_decay=0.0, rows=rows)
         if not anchor >= 0:
-            raise InputError(f"anchor {anchor}; expected a weight of at least 0")
+            raise InputError("anchor", f"{anchor}", "expected a weight of at least 0")
         weights = {name: value.detach().cpu().clone() for name, value in start.network.state_dict().items()}
         self.network.load_state_dict(weights)
         self.learning = let_learn(self.network, what, rank, generator)

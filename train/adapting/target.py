@@ -145,8 +145,9 @@ def _teacher(
     judges = {view.keyframe.number for view in views}
     if not judges <= set(target.held.numbers):
         raise InputError(
-            f"{sparse_map.source}: too few of its keyframes are held-out frames to judge what the others teach; "
-            f"{LEAST_VIEWS} are needed: raise --held-out, or leave --points and --overlap at 0"
+            sparse_map.source,
+            "too few of its keyframes are held-out frames to judge what the others teach",
+            f"{LEAST_VIEWS} are needed: raise --held-out, or leave --points and --overlap at 0",
         )
     teacher = MapTeacher(target.training, sparse_map, size, target.held.numbers, seed)
     known = sum(len(k.distances) for k in teacher.keyframes)

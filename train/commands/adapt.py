@@ -57,8 +57,9 @@ def adapt(
     """
     if map is None and config.taught:
         raise InputError(
-            f"--points {config.points}, --overlap {config.overlap} without --map; expected a map that teaches where "
-            "they are above 0"
+            "--points",
+            f"{config.points}, --overlap {config.overlap} without --map",
+            "expected a map that teaches where they are above 0",
         )
     arguments = recorded(
         source,
@@ -72,7 +73,7 @@ def adapt(
     )
     start = load_model(checkpoint, details=False)
     if not isinstance(start, NetworkModel):
-        raise InputError(f"--checkpoint {checkpoint}: has no weights to adapt; expected a trained checkpoint")
+        raise InputError("--checkpoint", f"{checkpoint} has no weights to adapt", "expected a trained checkpoint")
     quiet()
     with run_folder(output, "adapt", arguments, overwrite) as run:
         target = read_target(run, source, map, fit_light, config.held_out, start)

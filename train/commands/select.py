@@ -100,7 +100,11 @@ def select(
         with Progress("Selecting", len(frames)) as bar:
             verdicts = select_by_matching(frames, frames.names, OrientationDescriptor(), used, nodes, bar.advance)
     if not any(v.kept for v in verdicts):
-        raise InputError(f"{data}: none of the {len(verdicts)} frames is kept ({_counts(verdicts)}); nothing written")
+        raise InputError(
+            data,
+            f"none of the {len(verdicts)} frames is kept ({_counts(verdicts)})",
+            "loosen what rejects them; nothing was written",
+        )
     summary = f"{sum(v.kept for v in verdicts)} of {len(verdicts)} frames kept; rejected: {_counts(verdicts)}"
     folder = f"{data.resolve().name}/" if with_folder else ""
     header = [f"{data}: {summary}", how, *(f"{name}: {value}" for name, value in settings.items() if value is not None)]
@@ -123,14 +127,18 @@ def select(
 
 def _paths(output: Path, no_frames: bool, overwrite: bool) -> dict[str, Path]:
     if output.is_dir() or output.suffix in (".csv", ".html", ".png"):
-        raise InputError(f"-o {output}: expected the name of a list to write, such as frames.txt")
+        raise InputError(
+            "-o",
+            f"{output} is a folder, or named as what is written beside it",
+            "expected the name of a list to write, such as frames.txt",
+        )
     beside = output.parent / output.stem
     paths = {"list": output}
     for what, ending in (("table", ".csv"), ("sheet", "_contact.png"), ("page", ".html")):
         paths[what] = beside.with_name(beside.name + ending)
     there = [path for path in paths.values() if path.exists()]
     if there and not overwrite:
-        raise InputError(f"{there[0]}: already there; choose another -o, or give --overwrite")
+        raise InputError(there[0], "already there", "choose another -o, or give --overwrite")
     return paths
 
 

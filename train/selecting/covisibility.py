@@ -57,9 +57,17 @@ class NodeRules:
 
     def __post_init__(self) -> None:
         if min(self.min_views, self.min_frames, self.max_views) < 1 or min(self.min_matches, self.max_skipped) < 0:
-            raise InputError(f"{self}: expected min_views, min_frames and max_views of at least 1, and nothing below 0")
+            raise InputError(
+                "the rules of covisibility",
+                f"{self}",
+                "expected min_views, min_frames and max_views of at least 1, and nothing below 0",
+            )
         if self.max_views < self.min_views - 1:
-            raise InputError(f"max_views {self.max_views}: no node could have min_views {self.min_views}")
+            raise InputError(
+                "max_views",
+                f"{self.max_views}, and so no node could have min_views {self.min_views}",
+                "expected at least min_views",
+            )
 
 
 # Calibrated on the synthetic colons of tests/benchmarks/bench_select.py, seeds 100 to 107.
@@ -152,7 +160,7 @@ def select_by_matching(
         if len(node.views) > rules.max_views:
             node = None
     if not views_in:
-        raise InputError(f"no frame could be read; the first: {trouble}")
+        raise InputError("the frames", "none could be read", f"begin with the first: {trouble}")
     good = {id for id, views in views_in.items() if views >= rules.min_views}
     counts = [s.features for s in seen if s.node in good and s.features is not None]
     least = rules.blur * float(np.median(counts)) if counts else 0.0
@@ -221,7 +229,9 @@ class MapRules:
 
     def __post_init__(self) -> None:
         if min(self.points, self.keyframes, self.between) < 1:
-            raise InputError(f"{self}: expected points, keyframes and between of at least 1")
+            raise InputError(
+                "the rules of covisibility", f"{self}", "expected points, keyframes and between of at least 1"
+            )
 
 
 def select_by_map(
@@ -254,8 +264,10 @@ def select_by_map(
                     _best(found, n, Verdict("", True, "", submap.id))
     if not found.keys() & set(numbers):
         raise InputError(
-            f"{sparse_map.source}: its keyframes ({min(found)} to {max(found)}) are none of the {len(names)} frames "
-            f"({min(numbers)} to {max(numbers)}); frames and keyframes meet by the number in their names"
+            sparse_map.source,
+            f"its keyframes ({min(found)} to {max(found)}) are none of the {len(names)} frames ({min(numbers)} to "
+            f"{max(numbers)})",
+            "frames and keyframes meet by the number in their names",
         )
     missing = Verdict("", False, NOT_IN_MAP)
     return [replace(found.get(n, missing), name=name) for n, name in zip(numbers, names, strict=True)]
@@ -294,9 +306,13 @@ def published_pairs(folder: Path, sparse_map: SparseMap) -> dict[int, dict[int, 
         try:
             lines = [line.split() for line in files[0].read_text().splitlines() if line.strip()]
         except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{files[0]}: cannot be read ({error})") from error
+            raise InputError(
+                files[0], f"cannot be read ({error})", "expected lines NAME COVISIBLE COVISIBLE ..."
+            ) from error
         try:
             pairs[submap.id] = {frame_number(first): {frame_number(n) for n in rest} for first, *rest in lines}
         except InputError as error:
-            raise InputError(f"{files[0]}: {error}; expected lines NAME COVISIBLE COVISIBLE ...") from error
+            raise InputError(
+                files[0], f"{error.where}: {error.found}", "expected lines NAME COVISIBLE COVISIBLE ..."
+            ) from error
     return pairs

@@ -245,8 +245,9 @@ def read_loftr(settings: LoftrSettings) -> Any:
     if path is None or not path.is_file():
         found = "no weights given" if path is None else f"{path}: no such file"
         raise InputError(
-            f"{found}; LoFTR needs --loftr.weights FILE (kornia's loftr_outdoor.ckpt; nothing is downloaded), "
-            "or use --matcher sift, which needs none"
+            "--loftr.weights",
+            found,
+            "give a FILE (kornia's loftr_outdoor.ckpt; nothing is downloaded), or use --matcher sift, which needs none",
         )
     try:
         if path.suffix == ".safetensors":
@@ -260,7 +261,9 @@ def read_loftr(settings: LoftrSettings) -> Any:
         network = LoFTR(pretrained=None)
         network.load_state_dict(state)
     except (RuntimeError, OSError, ValueError, LookupError, EOFError, AttributeError, pickle.UnpicklingError) as error:
-        raise InputError(f"{path}: not LoFTR's weights ({str(error).splitlines()[0][:200]})") from error
+        raise InputError(
+            path, f"not LoFTR's weights ({str(error).splitlines()[0][:200]})", "expected kornia's loftr_outdoor.ckpt"
+        ) from error
     return network.eval().to(settings.device)
 
 
