@@ -87,8 +87,9 @@ def sparse_map_from_frames(
         if known is not None:
             failed = {n: r if frame_file(n) in known else "it has no known pose" for n, r in failed.items()}
         if not count:
+            size = f"{written.camera.width}x{written.camera.height}"
             raise InputError(
-                f"no sparse map of {len(frames)} frames of {written.camera.width}x{written.camera.height} could be made",
+                f"no sparse map of {len(frames)} frames of {size} could be made",
                 f"COLMAP connected no {config.min_model_size} of them by {config.min_points} points ({summary(why)})",
                 ADVICE,
             )
