@@ -13,16 +13,15 @@ import difflib
 import json
 import re
 import sys
-import types
-import typing
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, NoReturn, Union, get_args, get_origin
+from typing import Any, Literal, NoReturn, get_args, get_origin
 
 import yaml
 from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
 
+from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, literals, placeholder
 from lightdepth.command_line.pages import Page
 
 HELP, HELP_ALL = ("-h", "--help"), ("--help-all", "--help_all")
@@ -33,7 +32,6 @@ _GENERAL = {
     "print_shtab": "Print a script for the shell that completes the names of options, and exit.",
     "print_config": "Print all settings as YAML and exit: the beginning of a --config file.",
 }
-_METAVARS = {int: "N", float: "N", Path: "PATH", str: "TEXT", dict: "MAPPING"}
 _LAST = ("overwrite", "config", "print_config", "print_shtab", "help")
 _GROUP = "YAML file with any of the options of this group."
 
@@ -47,7 +45,7 @@ class Formatter(DefaultHelpFormatter):
     def _get_help_string(self, action: argparse.Action) -> str:
         """The sentence, and in brackets what kind of value is taken, where its placeholder does not show it."""
         kind, notes = getattr(action, "_typehint", None), ["required"] if action.required else []
-        if any(one in (int, float) for one in _choices_of_type(kind)) or not _METAVARS.keys() >= _leaves(kind):
+        if any(one in (int, float) for one in choices_of_type(kind)) or not METAVARS.keys() >= leaves(kind):
             notes.append(expected(kind))
         if action.default not in (None, argparse.SUPPRESS, ()) and action.nargs != 0:
             shown = (
@@ -57,10 +55,10 @@ class Formatter(DefaultHelpFormatter):
         return f"{action.help} ({'; '.join(notes)})" if notes else action.help or ""
 
     def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
-        kinds = list(_choices_of_type(getattr(action, "_typehint", None)))
+        kinds = list(choices_of_type(getattr(action, "_typehint", None)))
         if len(kinds) > 1 and get_origin(kinds[0]) is Literal:
             return "VALUE"
-        return _placeholder(kinds[0]) if kinds else action.dest.upper()
+        return placeholder(kinds[0]) if kinds else action.dest.upper()
 
 
 class Parser(ArgumentParser):
@@ -112,26 +110,6 @@ class Parser(ArgumentParser):
         return super()._check_value_key(action, value, key, *rest, **more)
 
 
-def _placeholder(kind: Any) -> str:
-    """What stands for a value of a type in the help."""
-    parts = get_args(kind)
-    if get_origin(kind) is Literal:
-        return f"{{{','.join(map(str, parts))}}}"
-    if get_origin(kind) is list or (get_origin(kind) is tuple and parts[1:] == (...,)):
-        return f"[{_placeholder(parts[0])}, ...]"
-    if get_origin(kind) is tuple:
-        return f"[{', '.join(map(_placeholder, parts))}]"
-    return _METAVARS.get(kind, getattr(kind, "__name__", "VALUE").upper())
-
-
-def _leaves(kind: Any) -> set[Any]:
-    """The types that a type is made of, without None and the values of Literals."""
-    if get_origin(kind) is Literal or kind in (None, type(None), bool, ...):
-        return set()
-    parts = get_args(kind)
-    return {leaf for part in parts for leaf in _leaves(part)} if parts else {kind}
-
-
 def options(parser: ArgumentParser) -> list[argparse.Action]:
     """What can be typed: options and positional arguments, without the heads of groups and the library's own helps."""
     found = []
@@ -158,9 +136,9 @@ def finish(parser: Parser, page: Page) -> None:
     for action in parser._actions:
         if _is_head(action):
             action.help = _GROUP
-        kind = next(_choices_of_type(getattr(action, "_typehint", None)), None)
+        kind = next(choices_of_type(getattr(action, "_typehint", None)), None)
         if action.option_strings and get_origin(kind) in (list, tuple):
-            action.metavar = _placeholder(kind)
+            action.metavar = placeholder(kind)
         for name, text in _GENERAL.items():
             if f"--{name}" in action.option_strings:
                 action.help = text
@@ -227,7 +205,7 @@ def _underscored(word: str) -> str:
 
 def listed(action: argparse.Action) -> tuple[Any, bool] | None:
     """Of an option that takes any number of values: their type, and whether each of them is a list in turn."""
-    kinds = list(_choices_of_type(getattr(action, "_typehint", None)))
+    kinds = list(choices_of_type(getattr(action, "_typehint", None)))
     if len(kinds) != 1:  # a single value may be one of the others
         return None
     arguments = get_args(kinds[0])
@@ -251,15 +229,6 @@ def _as_list(value: Any, of: Any, nested: bool) -> Any:
     if isinstance(value, (list, tuple)):
         return [value] if nested and value and not isinstance(value[0], (list, tuple)) else value
     return [value] if isinstance(value, (str, int, float, Path)) else value
-
-
-def _choices_of_type(kind: Any) -> Iterator[Any]:
-    """The types that a type allows, without None."""
-    if get_origin(kind) in (Union, types.UnionType):
-        for one in get_args(kind):
-            yield from _choices_of_type(one)
-    elif kind is not None and kind is not type(None):
-        yield kind
 
 
 # ---- mistakes
@@ -334,39 +303,9 @@ def _wrong_value(parser: Parser, argv: Sequence[str], key: str, message: str) ->
     named = f"{key}:" if where or action is None or not action.option_strings else f"--{key}"
     if kind is None or not value:
         return f"{where}{named} {' '.join(message.split())}"
-    choices = [c for one in _choices_of_type(kind) for c in _literals(one)]
+    choices = [c for one in choices_of_type(kind) for c in literals(one)]
     hint = _nearest(value, [str(c) for c in choices]) if choices else ""
     return f"{where}{named} {value}: expected {expected(kind)}{hint}"
-
-
-def _literals(kind: Any) -> tuple[Any, ...]:
-    """The values of a Literal, or of the Literals in a list."""
-    if get_origin(kind) is Literal:
-        return get_args(kind)
-    return tuple(c for part in get_args(kind) for c in _literals(part))
-
-
-def expected(kind: Any) -> str:
-    """A type in words: what a value must be."""
-    return " or ".join(dict.fromkeys(_in_words(one) for one in _choices_of_type(kind)))
-
-
-def _in_words(kind: Any) -> str:
-    plain = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
-    if kind in plain:
-        return plain[kind]
-    if get_origin(kind) is Literal:
-        return f"one of {', '.join(map(str, get_args(kind)))}"
-    parts = get_args(kind)
-    many = {int: "whole numbers", float: "numbers", str: "words", Path: "paths"}
-    if get_origin(kind) in (list, tuple) and parts:
-        each = many.get(parts[0], expected(parts[0]))
-        if get_origin(kind) is list or parts[1:] == (...,):
-            return f"a list of {each}" if parts[0] in many else f"a list, each {each}"
-        return f"{len(parts)} {each}, as {_placeholder(kind)}"
-    if get_origin(kind) is dict or kind is dict:
-        return "a mapping of names to values"
-    return typing.cast(str, getattr(kind, "__name__", str(kind)))
 
 
 def _on_line(argv: Sequence[str], key: str) -> bool:

@@ -23,10 +23,10 @@ from typing import Any
 import av
 import numpy as np
 
-from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import endomapper
 from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask
+from lightdepth.datasets.video_calibration import Calibration, found_calibration
 from lightdepth.errors import InputError
 from lightdepth.files.images import unit_range
 from lightdepth.frame import Frame
@@ -253,34 +253,6 @@ class VideoFile:
     def _pixels(self, frame: Any) -> np.ndarray:
         pixels = frame.to_ndarray(format="rgb48le" if self.bits > 8 else "rgb24", threads=1)
         return np.ascontiguousarray(np.rot90(pixels, self.rotation // 90)) if self.rotation else pixels
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """What is known of a video's endoscope; None where nothing was found."""
-
-    camera: CameraModel | None = None
-    light: PhotometricCalibration | None = None
-    mask: np.ndarray | None = None
-
-
-def found_calibration(path: Path, width: int, height: int) -> Calibration:
-    """camera.json, light.json and mask.png beside a video of this size, else EndoMapper's calibration.
-
-    Raises InputError where EndoMapper's tree says that the endoscope has none.
-    """
-    folder = path.parent
-    camera = light = None
-    if (folder / "camera.json").is_file():
-        camera = read_camera(folder / "camera.json")
-    elif (file := endomapper.calibration_file(folder, endomapper.GEOMETRY)) is not None:
-        camera = endomapper.at_size(read_camera(file), width, height, path.name)
-    if (folder / "light.json").is_file():
-        light = read_light(folder / "light.json")
-    elif (file := endomapper.calibration_file(folder, endomapper.PHOTOMETRY)) is not None:
-        light = read_light(file)
-    mask = read_mask(folder / "mask.png") if (folder / "mask.png").is_file() else None
-    return Calibration(camera, light, mask)
 
 
 def video_at(path: Path) -> Path | None:

@@ -13,7 +13,8 @@ from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.datasets import FrameSequence, SequenceSource, VideoFile
 from lightdepth.datasets.sequence import list_images, read_mask
-from lightdepth.datasets.video import found_calibration, quick_sample, video_at
+from lightdepth.datasets.video import quick_sample, video_at
+from lightdepth.datasets.video_calibration import found_calibration
 from lightdepth.errors import InputError
 from lightdepth.files.images import read_image, to_bgr8
 from lightdepth.photometry import PhotometricCalibration
