@@ -323,21 +323,32 @@ def _relative(a: np.ndarray, b: np.ndarray) -> float:
     return float((np.abs(a - b)[different] / np.maximum(np.abs(a), np.abs(b))[different].clip(1e-300)).max())
 
 
-def _of_json(one: Any, other: Any, tolerance: float, where: str = "") -> str:
-    """The first place where two records differ."""
+def _of_json(one: Any, other: Any, tolerance: float) -> str:
+    """The place where two records differ most, and in how many they do."""
+    found = sorted(_places(one, other, tolerance, ""), key=lambda place: -place[0])
+    more = f"; {len(found) - 1} more places differ by no more" if found[1:] else ""
+    return found[0][1] + more if found else ""
+
+
+def _places(one: Any, other: Any, tolerance: float, where: str) -> Iterator[tuple[float, str]]:
+    """Relative difference (infinite for what is no number) and a sentence for each place where two records differ."""
     if isinstance(one, dict) and isinstance(other, dict):
-        keys = [key for key in {**one, **other} if key not in LEFT_OUT]
-        lost = [key for key in keys if (key in one) != (key in other)]
-        if lost:
-            return f"{where}{lost[0]}: only in {'BASE' if lost[0] in one else 'HEAD'}"
-        return next(filter(None, (_of_json(one[k], other[k], tolerance, f"{where}{k}.") for k in keys)), "")
-    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
-        pairs = enumerate(zip(one, other, strict=True))
-        return next(filter(None, (_of_json(a, b, tolerance, f"{where}{i}.") for i, (a, b) in pairs)), "")
-    if isinstance(one, float) and isinstance(other, float):
+        for key in {**one, **other}:
+            if key in LEFT_OUT:
+                continue
+            if (key in one) != (key in other):
+                yield np.inf, f"{where}{key}: only in {'BASE' if key in one else 'HEAD'}"
+            else:
+                yield from _places(one[key], other[key], tolerance, f"{where}{key}.")
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for i, (a, b) in enumerate(zip(one, other, strict=True)):
+            yield from _places(a, b, tolerance, f"{where}{i}.")
+    elif isinstance(one, float) and isinstance(other, float):
         off = _relative(np.array([one]), np.array([other]))
-        return "" if off <= tolerance else f"{where.rstrip('.')}: {one} became {other} ({off:.2g})"
-    return "" if one == other else f"{where.rstrip('.')}: {one} became {other}"
+        if off > tolerance:
+            yield off, f"{where.rstrip('.')}: {one} became {other} ({off:.2g})"
+    elif one != other:
+        yield np.inf, f"{where.rstrip('.')}: {one} became {other}"
 
 
 def _counted(base: Path, head: Path, name: str) -> Iterator[str]:
