@@ -1,25 +1,30 @@
 """Whether two revisions make the same: every verb on the same input, byte for byte.
 
-    python tests/same_results.py BASE [HEAD] [--only demo,predict] [--tolerance 1e-6] [--cache DIR] [--plant]
+    python tests/same_results.py BASE [HEAD] [--only demo,predict] [--tolerance 1e-6] [--cache DIR] [--again] [--plant]
 
 BASE and HEAD are revisions, or `.` for the working tree (HEAD when it is left out). Each is run from its own checkout,
-through its own command line, on one thread, and what it made is kept in the cache by revision. Times, dates, versions
-and revisions are left out; so are the options that a run was given (they may have been renamed), and pages, which show
-times. Everything else has to be the same bytes; where the bytes differ, the largest relative difference of the numbers
-is printed, and counts against --tolerance. Exit code 1 when anything differs.
+through its own command line, one thread an item, and what it made is kept in the cache under the hash of its code: a
+commit that touches tests or pages alone is not run again. Times, dates, versions and revisions are left out; so are the
+options that a run was given (they may have been renamed), and the words of pages, which show times. Everything else has
+to be the same bytes; where the bytes differ, the largest relative difference of the numbers is printed, and counts
+against --tolerance. Exit code 1 when anything differs.
 
-`--plant` gives HEAD one setting that is off by 1 % and expects a difference: a check of this check.
+Two checks of this check: `--again` makes HEAD's results anew beside those in the cache, so that a revision can be held
+against itself; `--plant` gives each of HEAD's items one setting that is off by 1 % and fails where that goes unnoticed.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -31,6 +36,8 @@ ROOT = Path(__file__).resolve().parent.parent
 REALDATA = Path(os.environ.get("LIGHTDEPTH_REALDATA") or ROOT.parent / "shared" / "realdata")
 CLIP = REALDATA / "sinus/example_training_data_root/bag_1/_start_004259_end_004629_stride_25_segment_13"
 SINUS_MAP = REALDATA / "sinus" / "derived_colmap" / "sparse_txt" / "0"
+CODE = ("lightdepth", "densify", "train", "configs", "pyproject.toml")
+"""What a run depends on, as far as it lies in the repository."""
 SMALL = ["--size", "[160, 128]"]
 
 RUN = """
@@ -48,9 +55,10 @@ torch.set_num_threads(1)
 from lightdepth.cli import main
 sys.argv = ["lightdepth", *argv]
 code = main(argv)
-for name in ("lightdepth", "densify", "train"):
-    module = sys.modules.get(name)
-    assert module is None or module.__file__.startswith(tree + "/"), (name, module.__file__)
+for name, module in list(sys.modules.items()):
+    if name.split(".")[0] in ("lightdepth", "densify", "train") and getattr(module, "__file__", None):
+        assert module.__file__.startswith(tree + "/"), (name, module.__file__)
+assert "lightdepth" in sys.modules
 sys.exit(code)
 """
 
@@ -73,17 +81,8 @@ ITEMS: dict[str, list[str]] = {
     "live": ["live", "synth", "-o", "live", "--map", "synth/slam", "--checkpoint", "decline"],
     "train": ["train", "--config", "train.yaml", "-o", "train"],
     "adapt": [
-        "adapt",
-        "synth",
-        "-o",
-        "adapt",
-        "--map",
-        "synth/slam",
-        "--steps",
-        "4",
-        "--anchor",
-        "1",
-        "--keep-worse",
+        *("adapt", "synth", "-o", "adapt", "--map", "synth/slam", "--steps", "4", "--batch_size", "4"),
+        *("--points", "0.5", "--held-out", "0.5", "--keep-worse"),
     ],
     "sparse": ["sparse", "synth", "-o", "sparse"],
     "select": ["select", "synth", "-o", "select/list.txt"],
@@ -96,16 +95,29 @@ ITEMS: dict[str, list[str]] = {
 BEFORE = {"evaluate_depth": "predict"}
 """Items that read what another made; the others after `synth` read that."""
 FIRST = ("synth", "c3vd", "demo", "bench", "sinus", "sinus_paper")
-PLANTED = {"demo": None, "densify": ["--fusion.far", "2.02"], "live": ["--fusion.far", "2.02"]}
+PLANTED = {
+    "c3vd": ["--travel-mm", "30.3"],
+    "demo": ["--withhold", "0.202"],
+    "bench": ["--bending.slope_deviation", "0.303"],
+    "sinus": ["--agreement.overlap", "0.0303"],
+    "sinus_paper": ["--fusion.voxels_per_distance", "52.52"],
+    "densify": ["--fusion.far", "2.02"],
+    "live": ["--fusion.far", "2.02"],
+    "train": ["--model.learning_rate", "0.00202"],
+    "adapt": ["--learning-rate", "0.000505"],
+    "sparse": ["--sfm.contrast", "2.02"],
+}
 """Settings off by 1 %; items without any are left out of --plant."""
 
 LEFT_OUT = {"seconds", "started", "command", "versions", "revision", "peak_memory_mb", "arguments", "timings", "inputs"}
 """Keys of JSON: times, the machine, and how the run was asked for."""
-PASSED_OVER = ("config.yaml", "log.txt", "timings.csv", "timings.png", ".html", "tensorboard", ".ckpt", "model.md")
+PASSED_OVER = ("config.yaml", "log.txt", "timings.csv", "timings.png", "tensorboard", "model.md")
+"""Settings and times once more, and the card that model.safetensors holds as well."""
 UNORDERED = ("sinus_paper",)
 """Open3D gives the vertices of its volume in another order from run to run: they are compared in an order of ours."""
-COUNTED_ONLY = ("sparse",)
-"""pycolmap's mapping is not the same from run to run: cameras are compared, and counts of points to one in twenty."""
+COUNTED = ("sparse",)
+"""Sparse maps are the same bytes from run to run (on one thread). Under a tolerance they are compared by cameras and by
+counts of points, to one in twenty: a last bit decides which points a mapping keeps."""
 
 
 def main() -> int:
@@ -115,79 +127,106 @@ def main() -> int:
     parser.add_argument("--only", default="", help="items, comma between them")
     parser.add_argument("--tolerance", type=float, default=0.0, help="largest relative difference; 0 is the same bytes")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "lightdepth-same")
-    parser.add_argument("--plant", action="store_true", help="give HEAD a setting off by 1 %%, and expect a difference")
+    parser.add_argument("--again", action="store_true", help="make HEAD's results anew")
+    parser.add_argument("--plant", action="store_true", help="give HEAD settings off by 1 %%, and expect differences")
     given = parser.parse_args()
     wanted = [name for name in given.only.split(",") if name] or list(ITEMS)
-    wanted = [name for name in wanted if not name.startswith("sinus") or _there(CLIP)]
+    if unknown := set(wanted) - set(ITEMS):
+        parser.error(f"--only {', '.join(sorted(unknown))}; expected some of {', '.join(ITEMS)}")
+    if any(name.startswith("sinus") for name in wanted) and not CLIP.is_dir():
+        print(f"sinus and sinus_paper are left out: no real data at {CLIP}")
+        wanted = [name for name in wanted if not name.startswith("sinus")]
     if given.plant:
-        wanted = [name for name in wanted if PLANTED.get(name)]
-    base = made_by(given.base, wanted, given.cache)
-    head = made_by(given.head, wanted, given.cache, given.plant)
-    differences = [line for name in wanted for line in compared(base, head, name, given.tolerance)]
-    print("\n".join(differences) or f"the same: {', '.join(wanted)}")
+        wanted = [name for name in wanted if name in PLANTED]
+    base = made_by(given.base, wanted, given.cache, "made")
+    head = made_by(given.head, wanted, given.cache, "planted" if given.plant else "again" if given.again else "made")
+    if base == head:
+        print("the code is the same in both")
+    found = {name: list(compared(base, head, name, given.tolerance)) for name in wanted}
+    for name, lines in found.items():
+        print("\n".join(lines) or f"{name}: the same", flush=True)
     if given.plant:
-        print("planted change found" if differences else "PLANTED CHANGE NOT FOUND")
-        return 0 if differences else 1
-    return 1 if differences else 0
+        unseen = [name for name, lines in found.items() if not lines]
+        print(f"PLANTED CHANGE NOT FOUND: {', '.join(unseen)}" if unseen else "every planted change was found")
+        return 1 if unseen else 0
+    differing = [name for name, lines in found.items() if lines]
+    print(f"DIFFERENT: {', '.join(differing)}" if differing else f"the same: {', '.join(wanted)}")
+    return 1 if differing else 0
 
 
-def _there(folder: Path) -> bool:
-    if not folder.is_dir():
-        print(f"left out, no real data at {folder}")
-    return folder.is_dir()
-
-
-def made_by(revision: str, wanted: list[str], cache: Path, plant: bool = False) -> Path:
-    """The folder with what a revision made of all wanted items; what is in the cache is not made again."""
-    if revision == ".":
-        tree, folder = ROOT, cache / "working-tree"
+def made_by(revision: str, wanted: list[str], cache: Path, kind: str) -> Path:
+    """The folder with what a revision made of all wanted items; what is in the cache is not made again, but `again`."""
+    commit = _working_tree() if revision == "." else _git("rev-parse", "--verify", f"{revision}^{{tree}}")
+    key = hashlib.sha256(_git("ls-tree", commit, *CODE).encode()).hexdigest()[:12]
+    tree, folder = cache.resolve() / key / "tree", cache.resolve() / key / kind
+    if not tree.is_dir():
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache) as made:  # renamed when it is whole
+            archive = subprocess.run(["git", "archive", commit, *CODE], cwd=ROOT, capture_output=True, check=True)
+            subprocess.run(["tar", "-x", "-C", made], input=archive.stdout, check=True)
+            tree.parent.mkdir(exist_ok=True)
+            shutil.copytree(made, tree)
+    if kind == "again":
         shutil.rmtree(folder, ignore_errors=True)
-    else:
-        call = ["git", "rev-parse", "--verify", f"{revision}^{{commit}}"]
-        commit = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
-        tree, folder = cache / commit / "tree", cache / commit / ("planted" if plant else "made")
-        if not tree.is_dir():
-            tree.mkdir(parents=True)
-            archive = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=True).stdout
-            subprocess.run(["tar", "-x", "-C", str(tree)], input=archive, check=True)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "train.yaml").write_text(TRAIN)
     needed = [name for name in wanted if name not in FIRST]
     first = [name for name in FIRST if name in wanted or (name == "synth" and needed)]
     then = [name for name in ITEMS if name in {*needed, *(BEFORE[n] for n in needed if n in BEFORE)}]
     last = [name for name in then if name in BEFORE]
-    with ThreadPoolExecutor(2) as pool:  # the machine has two cores
+    with ThreadPoolExecutor(2) as pool:
         for wave in (first, [name for name in then if name not in last], last):
-            for name, said in zip(wave, pool.map(lambda n: _make(n, tree, folder, plant), wave), strict=True):
-                print(f"{revision}: {name}: {said}", flush=True)
+            for name, said in zip(wave, pool.map(lambda n: _make(n, tree, folder), wave), strict=True):
+                print(f"{revision} ({key}/{kind}): {name}: {said}", flush=True)
     return folder
 
 
-def _make(name: str, tree: Path, folder: Path, plant: bool) -> str:
-    done = folder / f"{name}.done"
-    if done.is_file():
+def _working_tree() -> str:
+    """The code as it lies there, as a tree of git's; what is staged stays as it is."""
+    with tempfile.TemporaryDirectory() as folder:
+        index = {"GIT_INDEX_FILE": str(Path(folder) / "index")}
+        _git("read-tree", "HEAD", **index)
+        _git("add", "--all", "--", *CODE, **index)
+        return _git("write-tree", **index)
+
+
+def _git(*argv: str, **env: str) -> str:
+    call = subprocess.run(["git", *argv], cwd=ROOT, env={**os.environ, **env}, capture_output=True, text=True)
+    return call.stdout.strip() if not call.returncode else sys.exit(f"git {' '.join(argv)}: {call.stderr.strip()}")
+
+
+def _make(name: str, tree: Path, folder: Path) -> str:
+    argv = ITEMS[name] + (PLANTED.get(name, []) if folder.name == "planted" else [])
+    done, record = folder / f"{name}.done", {"argv": argv, "train": TRAIN if name == "train" else ""}
+    if done.is_file() and json.loads(done.read_text()).items() >= record.items():
         return "in the cache"
     shutil.rmtree(folder / name, ignore_errors=True)
-    (folder / name).parent.mkdir(exist_ok=True)
-    argv = ITEMS[name] + ((PLANTED.get(name) or []) if plant else [])
-    threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
-    env = {**os.environ, **threads, "PYTHONPATH": "", "PYTHONHASHSEED": "0"}
+    for output in (folder / name, folder / f"{name}.log"):
+        output.parent.mkdir(exist_ok=True)
+    threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS")}
+    # Numba with two: `live` fuses views on a second core where there is one.
+    threads |= {"NUMBA_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": ""}
+    # PYTHONPATH is for processes that a run starts.
+    env = {**os.environ, **threads, "PYTHONPATH": str(tree), "PYTHONHASHSEED": "0"}
     call = [sys.executable, "-c", RUN, str(tree), *argv]
-    result = subprocess.run(call, cwd=folder, env=env, capture_output=True, text=True)
-    if result.returncode not in (0, 4):
-        sys.exit(f"{tree}: {name} ended with {result.returncode}:\n{result.stderr[-3000:]}")
-    done.write_text(str(result.returncode))
-    return "made"
+    start = time.perf_counter()
+    with (folder / f"{name}.log").open("w") as log:
+        code = subprocess.run(call, cwd=folder, env=env, stdout=log, stderr=subprocess.STDOUT).returncode
+    if code not in (0, 4):
+        sys.exit(f"{tree}: {name} ended with {code}:\n{(folder / f'{name}.log').read_text()[-3000:]}")
+    done.write_text(json.dumps({**record, "code": code}))
+    return f"{time.perf_counter() - start:.0f} s"
 
 
 def compared(base: Path, head: Path, name: str, tolerance: float) -> Iterator[str]:
     """A line for each thing that differs."""
-    if (base / f"{name}.done").read_text() != (head / f"{name}.done").read_text():
-        yield f"{name}: the exit codes differ"
+    codes = [json.loads((folder / f"{name}.done").read_text())["code"] for folder in (base, head)]
+    if codes[0] != codes[1]:
+        yield f"{name}: exit code {codes[0]} became {codes[1]}"
     before, after = _files(base / name), _files(head / name)
     for only, where in ((before - after, "BASE"), (after - before, "HEAD")):
         yield from (f"{name}/{path}: only in {where}" for path in sorted(map(str, only)))
-    if name in COUNTED_ONLY:
+    if name in COUNTED and tolerance:
         yield from _counted(base / name, head / name, name)
         return
     for path in sorted(before & after):
@@ -211,21 +250,20 @@ def _difference(base: Path, head: Path, tolerance: float, unordered: bool = Fals
         return ""
     if base.suffix == ".json":
         return _of_json(json.loads(base.read_text()), json.loads(head.read_text()), tolerance)
+    if base.suffix == ".html":
+        pictures = [re.findall(r"data:image/[^\"']+", path.read_text()) for path in (base, head)]
+        return "" if pictures[0] == pictures[1] else "the pictures differ"
     try:
         one, other = _numbers(base), _numbers(head)
     except ValueError:
         return "the bytes differ"
     if unordered and base.suffix == ".ply":
-        one, other = (
-            [made[0][np.lexsort(made[0].T)]] + [np.array(len(part)) for part in made] for made in (one, other)
-        )
+        one, other = _in_our_order(one), _in_our_order(other)
     if [a.shape for a in one] != [a.shape for a in other]:
         return f"{[a.shape for a in one]} became {[a.shape for a in other]}"
     largest = max((_relative(a, b) for a, b in zip(one, other, strict=True)), default=0.0)
-    if base.suffix in (".npz", ".safetensors") and not largest:
+    if (unordered or base.suffix in (".npz", ".safetensors", ".ckpt")) and not largest:
         return ""  # the same arrays: the bytes around them hold names of versions
-    if unordered and not largest:
-        return ""
     return "" if 0 < largest <= tolerance else f"the bytes differ; largest relative difference {largest:.3g}"
 
 
@@ -238,16 +276,45 @@ def _numbers(path: Path) -> list[np.ndarray]:
         from safetensors.numpy import load_file
 
         return [array for _, array in sorted(load_file(path).items())]
-    if path.suffix == ".ply":
-        import trimesh
+    if path.suffix == ".ckpt":  # the weights in float32; model.safetensors has them in float16
+        import torch
 
-        made: Any = trimesh.load(path, process=False)
-        faces = [np.asarray(made.faces)] if hasattr(made, "faces") else []
-        return [np.asarray(made.vertices), *faces]
+        state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
+        return [state[key].numpy() for key in sorted(state)]
+    if path.suffix == ".ply":
+        return _of_ply(path)
     if path.suffix in (".csv", ".tum", ".txt"):
         words = path.read_text().replace(",", " ").split()
         return [np.array([float(word) for word in words if _is_number(word)])]
     raise ValueError(path)
+
+
+def _of_ply(path: Path) -> list[np.ndarray]:
+    """Each property of the vertices, and the triangles, of a binary PLY as ours are."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    kinds = {"float": "<f4", "double": "<f8", "int": "<i4", "uint": "<u4", "uchar": "u1"}
+    elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
+    for word, *words in (line.split() for line in head.decode().splitlines() if line):
+        if word == "element":
+            elements[words[0]] = (int(words[1]), [])
+        elif word == "property" and words[0] == "list":  # triangles, so each list is of three
+            list(elements.values())[-1][1].extend(
+                ("count", kinds[words[1]]) if not i else (f"corner{i}", kinds[words[2]]) for i in range(4)
+            )
+        elif word == "property":
+            list(elements.values())[-1][1].append((words[1], kinds[words[0]]))
+    arrays = []
+    for count, properties in elements.values():
+        made = np.frombuffer(body, np.dtype(properties), count)
+        body = body[made.nbytes :]
+        arrays += [made[name] for name, _ in properties]
+    return arrays
+
+
+def _in_our_order(arrays: list[np.ndarray]) -> list[np.ndarray]:
+    """The vertices of a mesh by their coordinates; of its triangles, which count in the old order, only how many."""
+    order = np.lexsort(arrays[:3])
+    return [a[order] if len(a) == len(order) else np.zeros(len(a)) for a in arrays]
 
 
 def _is_number(word: str) -> bool:
@@ -266,21 +333,32 @@ def _relative(a: np.ndarray, b: np.ndarray) -> float:
     return float((np.abs(a - b)[different] / np.maximum(np.abs(a), np.abs(b))[different].clip(1e-300)).max())
 
 
-def _of_json(one: Any, other: Any, tolerance: float, where: str = "") -> str:
-    """The first place where two records differ."""
+def _of_json(one: Any, other: Any, tolerance: float) -> str:
+    """The place where two records differ most, and in how many they do."""
+    found = sorted(_places(one, other, tolerance, ""), key=lambda place: -place[0])
+    more = f"; {len(found) - 1} more places differ by no more" if found[1:] else ""
+    return found[0][1] + more if found else ""
+
+
+def _places(one: Any, other: Any, tolerance: float, where: str) -> Iterator[tuple[float, str]]:
+    """Relative difference (infinite for what is no number) and a sentence for each place where two records differ."""
     if isinstance(one, dict) and isinstance(other, dict):
-        keys = [key for key in {**one, **other} if key not in LEFT_OUT]
-        lost = [key for key in keys if (key in one) != (key in other)]
-        if lost:
-            return f"{where}{lost[0]}: only in {'BASE' if lost[0] in one else 'HEAD'}"
-        return next(filter(None, (_of_json(one[k], other[k], tolerance, f"{where}{k}.") for k in keys)), "")
-    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
-        pairs = enumerate(zip(one, other, strict=True))
-        return next(filter(None, (_of_json(a, b, tolerance, f"{where}{i}.") for i, (a, b) in pairs)), "")
-    if isinstance(one, float) and isinstance(other, float):
+        for key in {**one, **other}:
+            if key in LEFT_OUT:
+                continue
+            if (key in one) != (key in other):
+                yield np.inf, f"{where}{key}: only in {'BASE' if key in one else 'HEAD'}"
+            else:
+                yield from _places(one[key], other[key], tolerance, f"{where}{key}.")
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for i, (a, b) in enumerate(zip(one, other, strict=True)):
+            yield from _places(a, b, tolerance, f"{where}{i}.")
+    elif isinstance(one, float) and isinstance(other, float):
         off = _relative(np.array([one]), np.array([other]))
-        return "" if off <= tolerance else f"{where.rstrip('.')}: {one} became {other} ({off:.2g})"
-    return "" if one == other else f"{where.rstrip('.')}: {one} became {other}"
+        if off > tolerance:
+            yield off, f"{where.rstrip('.')}: {one} became {other} ({off:.2g})"
+    elif one != other:
+        yield np.inf, f"{where.rstrip('.')}: {one} became {other}"
 
 
 def _counted(base: Path, head: Path, name: str) -> Iterator[str]:
