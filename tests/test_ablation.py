@@ -25,10 +25,10 @@ from lightdepth.photometry import PhotometricCalibration
 from train.ablation.plan import plans_of
 from train.ablation.rows import JudgedColons, Row
 from train.ablation.table import METRICS, Result, Table, clear, lines, markdown, write_table
-from train.cli import training_parser
 from train.colons import TubeData, with_reflectance
 from train.commands.ablate import ablate
 from train.datamodule import FrameData, FrameDataModule
+from train.parser import training_parser
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted((ROOT / "configs" / "ablation").glob("*.yaml"))

@@ -71,7 +71,7 @@ def test_the_settings_of_a_run_of_0_1_0_are_taken_as_they_are():
 
 
 def test_the_settings_of_a_training_of_0_1_0_are_taken_as_they_are():
-    from train.cli import as_yaml, training_parser
+    from train.parser import as_yaml, training_parser
 
     parser = training_parser()
     argv = without_gone("train", ["--config", str(GOLDEN / "trained" / "config.yaml"), "-o", "out"])

@@ -62,7 +62,7 @@ def test_every_command_of_the_readme_is_understood(command):
     (entry,) = metadata.entry_points(group=GROUP, name=verb)
     if verb in ("bench", "train"):  # which parse their own words
         if verb == "train":
-            from train.cli import training_parser
+            from train.parser import training_parser
 
             parser = training_parser()
         else:

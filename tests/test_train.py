@@ -28,7 +28,7 @@ from lightdepth.module import LightDepth
 from lightdepth.network import NetworkConfig
 from lightdepth.tube import lens
 from train.callbacks import validation_line
-from train.cli import train
+from train.commands.train import train
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs" / "train").glob("*.yaml"))
 TINY_RUN = [

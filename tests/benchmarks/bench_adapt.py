@@ -25,9 +25,9 @@ from lightdepth.frame import Frame
 from lightdepth.geometry import depth_from_distance
 from lightdepth.metrics import DepthErrors
 from lightdepth.tube import lens, tube_frames
-from train.cli import train
 from train.colons import TubeData, tube_config
 from train.commands.adapt import adapt as adapt_verb
+from train.commands.train import train
 
 adapt = by_options(adapt_verb)
 

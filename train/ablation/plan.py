@@ -16,8 +16,8 @@ from lightdepth.command_line.presets import shipped
 from lightdepth.errors import InputError
 from lightdepth.reporting.run import plain
 
-from ..cli import as_yaml
 from ..colons import TubeData, colon_seeds
+from ..parser import as_yaml
 from .rows import JudgedColons, Row, Settings
 
 

@@ -21,9 +21,9 @@ from lightdepth.files.writing import write_whole
 from lightdepth.models import NetworkModel
 from lightdepth.reporting.run import plain
 
-from ..cli import as_yaml
 from ..datamodule import FrameDataModule
 from ..fit import fit
+from ..parser import as_yaml
 from .judge import Judge
 from .plan import Plan
 from .table import Result

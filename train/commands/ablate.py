@@ -22,7 +22,7 @@ from ..ablation.plan import check, check_apart, plans_of
 from ..ablation.rows import JudgedColons, Row, Settings
 from ..ablation.run import finished, say, train_all
 from ..ablation.table import Table, write_table
-from ..cli import training_parser
+from ..parser import training_parser
 from ..running import quiet
 
 _OURS = ("ablation.md", "ablation.csv", "ablation.json", "run.json")

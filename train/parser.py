@@ -1,10 +1,7 @@
-"""`lightdepth train`."""
+"""The parser of `lightdepth train`: every option of the model, its data, how it is watched, and Lightning's Trainer."""
 
 from __future__ import annotations
 
-import sys
-from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lightdepth.command_line.pages import PAGES
@@ -25,36 +22,6 @@ TRAINER_DEFAULTS = {
     "trainer.log_every_n_steps": 10,
     "trainer.enable_model_summary": False,
 }
-
-
-def train(argv: list[str] | None = None) -> int:
-    """Train a depth network on frames alone, from the decline of the light.
-
-    `lightdepth train --preset NAME -o RUN [--resume | --overwrite] [overrides]`: every option of data, model and
-    Lightning's Trainer is a dotted override. `--resume` without --preset and --config takes the run's config.yaml.
-    """
-    import lightning.pytorch as pl
-
-    from lightdepth.command_line.gone_settings import without_gone
-    from lightdepth.command_line.parsing import parsed
-    from lightdepth.command_line.presets import with_preset
-
-    from .datamodule import FrameDataModule
-    from .fit import check_output, fit
-
-    given = list(sys.argv[1:] if argv is None else argv)
-    parser = training_parser()
-    argv = without_gone("train", _with_own_config(with_preset("train", given, parser.error)))
-    config = parsed(parser, argv)
-
-    output = Path(config.output)
-    check_output(output, config.resume, config.overwrite)  # before the seconds that the rest takes
-    pl.seed_everything(config.seed, workers=True, verbose=False)
-    made = parser.instantiate(config)
-    text = as_yaml(parser, config)
-    flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given, "settings": made.fit}
-    fit(made.model, FrameDataModule(made.data), output, vars(made.trainer), text, config.seed, **flags)
-    return 0
 
 
 def training_parser() -> Parser:
@@ -99,14 +66,3 @@ def as_yaml(parser: ArgumentParser, config: Namespace) -> str:
         kept.pop(key, None)
     result: str = parser.dump(kept, skip_validation=True)
     return result
-
-
-def _with_own_config(argv: list[str]) -> list[str]:
-    """`--resume` without --preset and --config takes the config.yaml of the run."""
-    if "--resume" not in argv or any(a == "--config" or a.startswith("--config=") for a in argv):
-        return argv
-    for flag, value in pairwise([*argv, ""]):
-        folder = flag.partition("=")[2] if flag.startswith("--output=") else value if flag in ("-o", "--output") else ""
-        if folder and (Path(folder) / "config.yaml").is_file():
-            return ["--config", str(Path(folder) / "config.yaml"), *argv]
-    return argv
