@@ -274,7 +274,7 @@ def _overlap_rows(
 
 
 @dataclass(frozen=True)
-class Gap:
+class OverlapGap:
     """Pixels X of one view as another sees them: `gap` (n,) = log |X - c| - log d(p), where `known` (n,); p at `x`
     (n, 2) in [0, 1]², log predicted distance there (n,), and `log_reach` (n,) = log |X - c|."""
 
@@ -285,7 +285,7 @@ class Gap:
     log_reach: np.ndarray
 
 
-def gap_between(view: View, other: View, bend: Bend, rays: np.ndarray, log_d: np.ndarray) -> Gap:
+def gap_between(view: View, other: View, bend: Bend, rays: np.ndarray, log_d: np.ndarray) -> OverlapGap:
     """Pixels of `view`, on unit rays (n, 3) at log distance log_d (n,), against the depth of `other`, bent."""
     other_from_view = other.keyframe.cam_from_map @ np.linalg.inv(view.keyframe.cam_from_map)
     points = (rays * np.exp(log_d)[:, None]) @ other_from_view[:3, :3].T + other_from_view[:3, 3]
@@ -295,4 +295,4 @@ def gap_between(view: View, other: View, bend: Bend, rays: np.ndarray, log_d: np
     log_predicted, known = other.at(x)
     log_reach = np.log(np.linalg.norm(points, axis=1).clip(min=1e-12))
     d = log_predicted + bend.basis(x, log_predicted) @ bend.weights
-    return Gap(log_reach - d, seen & known, x, log_predicted, log_reach)
+    return OverlapGap(log_reach - d, seen & known, x, log_predicted, log_reach)

@@ -11,7 +11,7 @@ from densify.agreement import View, agree
 from densify.alignment import Alignment, AlignmentConfig, align, bent
 from densify.bending import Bend
 from densify.config import MethodConfig
-from densify.predictions import Seen
+from densify.predictions import SeenKeyframe
 from lightdepth.observations import ObservedDistances, observed_distances, unobserved
 from lightdepth.sparse_map import Keyframe, Submap
 
@@ -41,7 +41,7 @@ class AlignedKeyframe:
 def align_alone(
     keyframe: Keyframe,
     submap: Submap,
-    seen: Seen,
+    seen: SeenKeyframe,
     config: AlignmentConfig,
     withhold: float = 0.0,
     seed: int = 0,

@@ -10,7 +10,7 @@ from densify.config import DensifyConfig
 from densify.joining import MergeConfig, Merged, joined_name, merge
 from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify
-from densify.predictions import Seen
+from densify.predictions import SeenKeyframe
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
@@ -43,7 +43,7 @@ class Densified:
         count = sum(len(s.keyframes) for s in sparse_map.submaps)
         with Progress("Densifying", count) as bar:
 
-            def show(submap: Submap, aligned: AlignedKeyframe, seen: Seen) -> None:
+            def show(submap: Submap, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
                 gallery(submap, aligned, seen)
                 bar.advance()
 

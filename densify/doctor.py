@@ -18,64 +18,64 @@ from lightdepth.reporting.run import versions
 
 
 @dataclass(frozen=True)
-class Finding:
+class Check:
     what: str
     ok: bool
     detail: str
 
 
-def examine() -> list[Finding]:
+def examine() -> list[Check]:
     """All checks, in the order in which they build on each other."""
     found = versions()
     needed = ("torch", "lightning", "kornia", "numpy", "scipy", "pycolmap", "opencv-python-headless")
-    findings = [Finding("python", True, f"{found['python']} on {platform.machine()}, {os.cpu_count()} cores")]
-    findings += [Finding(name, name in found, found.get(name, f"missing: pip install {name}")) for name in needed]
+    findings = [Check("python", True, f"{found['python']} on {platform.machine()}, {os.cpu_count()} cores")]
+    findings += [Check(name, name in found, found.get(name, f"missing: pip install {name}")) for name in needed]
     findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), _torchvision()]
     return findings
 
 
-def _open3d(found: dict[str, str]) -> Finding:
+def _open3d(found: dict[str, str]) -> Check:
     version = found.get("open3d-cpu") or found.get("open3d") or "missing"
     absent = native.missing_system_libraries()
     try:
         native.open3d()
     except InputError as error:
         cure = f"; missing: apt-get install {' '.join(absent)}" if absent else ""
-        return Finding("open3d", False, f"{error}{cure}")
+        return Check("open3d", False, f"{error}{cure}")
     note = f"; not found by the loader, yet not needed so far: {' '.join(absent)}" if absent else ""
-    return Finding("open3d", True, f"{version}, loads{note}")
+    return Check("open3d", True, f"{version}, loads{note}")
 
 
-def _torch_device() -> Finding:
+def _torch_device() -> Check:
     import torch
 
     if torch.cuda.is_available():
         note = "" if native.has_warp() else "; synthetic colons are rendered on the CPU: pip install 'lightdepth[gpu]'"
-        return Finding("device", True, f"cuda: {torch.cuda.get_device_name(0)}{note}")
-    return Finding(
+        return Check("device", True, f"cuda: {torch.cuda.get_device_name(0)}{note}")
+    return Check(
         "device", True, f"cpu, {torch.get_num_threads()} threads (a GPU is used where there is one, never needed)"
     )
 
 
-def _pycolmap() -> Finding:
+def _pycolmap() -> Check:
     try:
         names = ("extract_features", "match_sequential", "incremental_mapping", "Reconstruction")
         missing = [name for name in names if not hasattr(native.pycolmap(), name)]
     except ImportError as error:
-        return Finding("pycolmap calls", False, f"{error}: pip install 'pycolmap>=4'")
-    return Finding("pycolmap calls", not missing, f"lacks {', '.join(missing)}" if missing else "all there")
+        return Check("pycolmap calls", False, f"{error}: pip install 'pycolmap>=4'")
+    return Check("pycolmap calls", not missing, f"lacks {', '.join(missing)}" if missing else "all there")
 
 
-def _torchvision() -> Finding:
+def _torchvision() -> Check:
     from importlib.util import find_spec
 
     if find_spec("torchvision") is None:
-        return Finding("torchvision", True, "absent, as it should be")
+        return Check("torchvision", True, "absent, as it should be")
     try:
         import torchvision  # noqa: F401
     except Exception as error:
-        return Finding("torchvision", False, f"broken ({error}), and breaks lightning: pip uninstall torchvision")
-    return Finding("torchvision", True, "there and loads; not needed")
+        return Check("torchvision", False, f"broken ({error}), and breaks lightning: pip uninstall torchvision")
+    return Check("torchvision", True, "there and loads; not needed")
 
 
 def fused_plane_error(voxel: float = 0.5, distance: float = 30.0) -> tuple[int, float]:
@@ -90,9 +90,9 @@ def fused_plane_error(voxel: float = 0.5, distance: float = 30.0) -> tuple[int, 
     return len(vertices), error
 
 
-def _fused_plane() -> Finding:
+def _fused_plane() -> Check:
     try:
         count, error = fused_plane_error()
     except InputError as error_found:
-        return Finding("fused plane", False, str(error_found))
-    return Finding("fused plane", count > 1000 and error < 0.5, f"{count} vertices, largest error {error:.2g} voxels")
+        return Check("fused plane", False, str(error_found))
+    return Check("fused plane", count > 1000 and error < 0.5, f"{count} vertices, largest error {error:.2g} voxels")

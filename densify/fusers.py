@@ -16,7 +16,7 @@ from densify.dense_map import Contribution, DenseMap
 from densify.fusion.plain import PlainTsdf, undistorted
 from densify.fusion.rectify import SurfaceView, surface_view
 from densify.fusion.volume import TsdfVolume
-from densify.predictions import Seen
+from densify.predictions import SeenKeyframe
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Submap
 
@@ -24,7 +24,7 @@ from lightdepth.sparse_map import Submap
 class Fuser(Protocol):
     """One surface in the making."""
 
-    def add(self, aligned: AlignedKeyframe, seen: Seen) -> None:
+    def add(self, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
         """Fuses a keyframe whose alignment is ok, but for its contradicted pixels."""
 
     def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
@@ -52,7 +52,7 @@ class FullFuser:
         self._config, self._volume = config, TsdfVolume(voxel, config.fusion)
         self._contributions: dict[str, Contribution] = {}
 
-    def add(self, aligned: AlignedKeyframe, seen: Seen) -> None:
+    def add(self, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
         assert seen.frame is not None and seen.prediction is not None
         prediction = seen.prediction
         if aligned.stays is not None:
@@ -72,7 +72,7 @@ class PaperFuser:
         self._far, self._voxel = config.fusion.far, voxel
         self._volume = PlainTsdf(voxel, config.fusion.truncation)
 
-    def add(self, aligned: AlignedKeyframe, seen: Seen) -> None:
+    def add(self, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
         assert seen.frame is not None and seen.prediction is not None
         alignment = aligned.alignment
         depth = undistorted(alignment.applied(seen.prediction), seen.frame.image, self._far * alignment.range_90)

@@ -13,7 +13,7 @@ from densify.dense_map import DenseMap
 from densify.evaluation.records import MapFigures
 from densify.joining import Merged, joined_name
 from densify.pipeline import SubmapResult
-from densify.predictions import Seen
+from densify.predictions import SeenKeyframe
 from lightdepth.reporting.figures import (
     BAD,
     GOOD,
@@ -43,7 +43,7 @@ class Gallery:
         }
         self.pictures: dict[int, list[tuple[bytes, str]]] = {s.id: [] for s in sparse_map.submaps}
 
-    def __call__(self, submap: Submap, aligned: AlignedKeyframe, seen: Seen) -> None:
+    def __call__(self, submap: Submap, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
         if (submap.id, aligned.keyframe.number) not in self._chosen or seen.frame is None or seen.prediction is None:
             return
         assert aligned.observed is not None
@@ -227,7 +227,7 @@ def mesh_pictures(dense: DenseMap, name: str = "") -> list[tuple[bytes, str]]:
     if dense.weights is not None:
         colors = np.where(seen_well(dense)[:, None], SEEN_WELL, SEEN_WEAKLY)
         pictures.append(
-            (png(mesh_picture(dense.vertices, dense.triangles, colors)), "Seen well (green), weakly (orange)")
+            (png(mesh_picture(dense.vertices, dense.triangles, colors)), "SeenKeyframe well (green), weakly (orange)")
         )
     return pictures
 

@@ -14,7 +14,7 @@ from densify.coverage import Coverage, coverage, seen_share
 from densify.dense_map import DenseMap
 from densify.evaluation.withheld import Withheld
 from densify.fusers import fuser_for
-from densify.predictions import Clock, Predictions, Predictor, Seen
+from densify.predictions import Clock, Predictions, Predictor, SeenKeyframe
 from lightdepth.brief import Brief
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
@@ -39,7 +39,7 @@ class SubmapResult(Brief):
     """what of the wall was seen; None under the paper's recipe, whose fusion cannot tell"""
 
 
-OnKeyframe = Callable[[Submap, AlignedKeyframe, Seen], None]
+OnKeyframe = Callable[[Submap, AlignedKeyframe, SeenKeyframe], None]
 """Is shown every keyframe as it is done: its submap, its alignment and what that rests on, its image and prediction."""
 
 

@@ -28,7 +28,7 @@ class Clock(dict[str, float]):
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenKeyframe:
     """A keyframe's image and what a model says of it; both are None where the image is missing or unreadable, and
     `reason` says why."""
 
@@ -49,11 +49,11 @@ class Predictions:
 
     def __init__(self, frames: FrameSequence, model: Predictor, keep_mb: float, clock: Clock | None = None) -> None:
         self.frames, self._model, self._clock = frames, model, Clock() if clock is None else clock
-        self._kept: dict[str, Seen] = {}
+        self._kept: dict[str, SeenKeyframe] = {}
         self._counted: set[str] = set()
         self._room = keep_mb * 2**20
 
-    def of(self, keyframe: Keyframe) -> Seen:
+    def of(self, keyframe: Keyframe) -> SeenKeyframe:
         """The keyframe's image under the map's own camera, with distance alone predicted (no albedo, no normals)."""
         if keyframe.name in self._kept:
             return self._kept[keyframe.name]
@@ -65,11 +65,11 @@ class Predictions:
                 self._kept[keyframe.name] = seen
         return seen
 
-    def _made(self, keyframe: Keyframe) -> Seen:
+    def _made(self, keyframe: Keyframe) -> SeenKeyframe:
         try:
             with self._clock("read"):
                 frame = self.frames.of_keyframe(keyframe)
         except InputError as error:
-            return Seen(reason=str(error))
+            return SeenKeyframe(reason=str(error))
         with self._clock("predict"):
-            return Seen(frame, replace(self._model(frame), albedo=None, normals=None))
+            return SeenKeyframe(frame, replace(self._model(frame), albedo=None, normals=None))

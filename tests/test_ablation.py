@@ -24,7 +24,7 @@ from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
 from train.ablation.plan import plans_of
 from train.ablation.rows import JudgedColons, Row
-from train.ablation.table import METRICS, Result, Table, clear, lines, markdown, write_table
+from train.ablation.table import METRICS, AblationTable, Result, clear, lines, markdown, write_table
 from train.colons import TubeData, with_reflectance
 from train.commands.ablate import ablate
 from train.datamodule import FrameData, FrameDataModule
@@ -214,10 +214,10 @@ def result(row: str, seed: int, ratio: float, told: str = "true", failed: str = 
     return Result(row, seed, 10, 100, 60.0, [(5, 1.0), (10, 0.5)], errors, closed, failed)
 
 
-def table_of(**ratios: tuple[float, ...]) -> Table:
+def table_of(**ratios: tuple[float, ...]) -> AblationTable:
     rows = tuple(Row(name.replace("_", " "), part="dropped") for name in ratios)
     results = [result(n.replace("_", " "), s, r) for n, values in ratios.items() for s, r in enumerate(values)]
-    return Table("base", rows, JUDGED, results, TubeData(scenes=2), (40, 32), 4)
+    return AblationTable("base", rows, JUDGED, results, TubeData(scenes=2), (40, 32), 4)
 
 
 def test_a_difference_is_clear_where_its_mean_is_larger_than_its_spread_over_the_seeds():
@@ -250,7 +250,7 @@ def test_a_difference_is_clear_where_its_mean_is_larger_than_its_spread_over_the
 @pytest.mark.parametrize("base", [result("base", 3, 0.8), result("base", 9, 0.8, failed="it went nowhere")])
 def test_a_row_without_a_seed_in_common_with_the_first_is_shown_with_nothing_to_compare(base, tmp_path):
     rows = (Row("base"), Row("other", part="reference", seeds=(9,)))
-    table = Table("base", rows, JUDGED, [base, result("other", 9, 0.9)], TubeData(scenes=2), (40, 32), 4)
+    table = AblationTable("base", rows, JUDGED, [base, result("other", 9, 0.9)], TubeData(scenes=2), (40, 32), 4)
     write_table(table, tmp_path, None)
     text = (tmp_path / "ablation.md").read_text()
     assert "| other |  | .900 |  | no seed that the first row has |" in text

@@ -20,7 +20,7 @@ from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
 from train.adapting.card import source_colons, target_loss
 from train.adapting.judging import Judgement, Verdict, verdict
-from train.adapting.module import Adaptation, anchor_loss, let_learn, merge
+from train.adapting.module import Adaptation, anchor_loss, let_learn, merge_low_rank
 from train.colons import TubeData
 from train.commands.adapt import adapt as adapt_verb
 from train.datamodule import FrameData, FrameDataModule, collate
@@ -185,7 +185,7 @@ def trained(network_, what: str, steps: int = 3, rank: int = 4, **options) -> Ad
 def test_what_does_not_learn_stays_equal_to_the_bit(what, learns, norm):
     before = {name: value.clone() for name, value in network(norm).state_dict().items()}
     module = trained(network(norm), what)
-    merge(module.network)
+    merge_low_rank(module.network)
     after = module.network.state_dict()
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert changed and all(learns(name) for name in changed)
@@ -197,7 +197,7 @@ def test_low_rank_additions_end_as_plain_weights_that_compute_the_same():
     module = trained(network(), "low_rank", rank=2, generator=torch.Generator().manual_seed(0))
     batch = to_batch(colon(count=10).frames[0], SIZE)
     apart, _ = module(batch)
-    merge(module.network)
+    merge_low_rank(module.network)
     assert module.network.state_dict().keys() == before.keys()
     assert torch.allclose(module(batch)[0], apart, rtol=1e-5)
     name = "body.encoder.1.conv1.weight"

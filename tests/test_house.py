@@ -100,3 +100,13 @@ def passed_on(function: Function) -> list[ast.Call]:
 
 def test_no_function_passes_on_arguments_that_it_does_not_name():
     assert [place for place, function in functions() if passed_on(function)] == []
+
+
+def test_the_method_fits_on_a_screen():
+    """densify_submap with what it calls in its own module; everything else that it calls has a room of its own."""
+    source = (ROOT / "densify" / "pipeline.py").read_text()
+    own = {node.name: node for node in ast.parse(source).body if isinstance(node, Function)}
+    method = own["densify_submap"]
+    called = {node.id for node in ast.walk(method) if isinstance(node, ast.Name)} & own.keys()
+    lengths = [(own[name].end_lineno or 0) - own[name].lineno + 1 for name in {"densify_submap", *called}]
+    assert ast.get_docstring(method) and sum(lengths) <= 50

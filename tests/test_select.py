@@ -42,9 +42,9 @@ from train.selecting.covisibility import (
     select_by_matching,
 )
 from train.selecting.matching import (
-    Agreement,
     LoftrMatcher,
     LoftrSettings,
+    MatchAgreement,
     OrientationDescriptor,
     SiftMatcher,
     epipolar_inliers,
@@ -77,10 +77,10 @@ class Scripted:
     def count(self, kept: int) -> int:
         return self.features[kept]
 
-    def agree(self, one: int, other: int) -> Agreement:
+    def agree(self, one: int, other: int) -> MatchAgreement:
         self.matched.append((one, other))
         same = self.word[one].lower() == self.word[other].lower()
-        return Agreement(100 if same else 0, 0.5 if same else 0.0)
+        return MatchAgreement(100 if same else 0, 0.5 if same else 0.0)
 
     def select(self, rules: NodeRules = RULES):
         return select_by_matching(self.frames, self.names, self.describe, self, rules)

@@ -57,7 +57,7 @@ class Panels(pl.Callback):
         logger.experiment.add_image("val/images", torch.cat(rows, -2).clamp(0, 1), trainer.global_step)
 
 
-class Progress(pl.Callback):
+class TrainingProgress(pl.Callback):
     """One line every `every` steps, with speed and time left, and one per validation. `echo` takes each line.
 
     The logger gets the speed as frames per second, over all processes.

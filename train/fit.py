@@ -39,7 +39,7 @@ from lightdepth.network import DepthNetwork
 from lightdepth.reporting.run import input_hash, versions, write_run_json
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
-from .callbacks import Diagnosis, DiagnosisConfig, Panels, Progress, validation_line
+from .callbacks import Diagnosis, DiagnosisConfig, Panels, TrainingProgress, validation_line
 from .card import Card, Doubt
 from .colons import TubeData
 from .datamodule import FrameDataModule
@@ -276,7 +276,7 @@ def _with_callbacks(
         ),
         Panels(),
         Diagnosis(settings.diagnosis, data.names),
-        Progress(echo, every=report_every(steps)),
+        TrainingProgress(echo, every=report_every(steps)),
         _SaveLast(output / "checkpoints" / "last.ckpt"),
     ]
     if settings.ema > 0:

@@ -85,7 +85,7 @@ class MergeConfig:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class SurfaceAgreement:
     """Two joined surfaces along the rays of the cameras that see both: the median gap over the distance, the share of
     a camera's rays that meet both, and the share on which the other surface stands in front."""
 
@@ -106,7 +106,7 @@ class Join:
     matches: int = 0
     agreeing: int = 0
     error: float = 0.0
-    surfaces: Agreement | None = None
+    surfaces: SurfaceAgreement | None = None
     reason: str = ""
 
     @property

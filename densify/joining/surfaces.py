@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from densify.joining.join import Agreement, Join
+from densify.joining.join import Join, SurfaceAgreement
 from densify.joining.keyframes import moved_keyframe
 from densify.joining.side import Side
 from densify.similarity import Similarity
@@ -23,7 +23,7 @@ def ray_grid(camera: CameraModel, stride: int) -> np.ndarray:
     return result
 
 
-def surfaces_agree(target: Side, source: Side, similarity: Similarity) -> Agreement | None:
+def surfaces_agree(target: Side, source: Side, similarity: Similarity) -> SurfaceAgreement | None:
     """Gap, overlap and occlusion of two joined surfaces along the rays of up to eight keyframes of each; None where no
     camera sees enough of both."""
     rays_seen = []
@@ -42,7 +42,7 @@ def surfaces_agree(target: Side, source: Side, similarity: Similarity) -> Agreem
     return _agreement(rays_seen, target.config.min_overlap)
 
 
-def _agreement(rays_seen: Sequence[tuple[np.ndarray, np.ndarray]], min_overlap: float) -> Agreement | None:
+def _agreement(rays_seen: Sequence[tuple[np.ndarray, np.ndarray]], min_overlap: float) -> SurfaceAgreement | None:
     overlap = [np.isfinite(far[np.isfinite(own)]).mean() if np.isfinite(own).any() else 0.0 for own, far in rays_seen]
     chosen = [r for r, share in zip(rays_seen, overlap, strict=True) if share >= min_overlap]
     if not chosen:
@@ -50,7 +50,7 @@ def _agreement(rays_seen: Sequence[tuple[np.ndarray, np.ndarray]], min_overlap: 
     own, far = (np.concatenate(part) for part in zip(*chosen, strict=True))
     both = np.isfinite(own) & np.isfinite(far)
     ratio = far[both] / own[both]
-    return Agreement(float(np.median(np.abs(ratio - 1))), float(max(overlap)), float((ratio < 0.75).mean()))
+    return SurfaceAgreement(float(np.median(np.abs(ratio - 1))), float(max(overlap)), float((ratio < 0.75).mean()))
 
 
 def checked(join: Join, target: Side, source: Side, max_gap: float) -> Join:

@@ -29,7 +29,7 @@ from densify.fusion.patches import BlockSurface, Patch, joined
 from densify.fusion.rectify import SurfaceView
 from densify.fusion.volume import TsdfVolume
 from densify.live.packed import PackedView, Packing
-from densify.predictions import Predictor, Seen
+from densify.predictions import Predictor, SeenKeyframe
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.images import unit_range
@@ -155,7 +155,7 @@ class Densifier:
         with self._timed("integrate"):
             prediction = packing.round(prediction)
         with self._timed("align"):
-            alignment = self._aligned(keyframe, points, Seen(frame, prediction))
+            alignment = self._aligned(keyframe, points, SeenKeyframe(frame, prediction))
         with self._timed("integrate"):
             self._add(_Kept(keyframe, points, packing.done(), alignment), prediction)
         return alignment
@@ -262,7 +262,7 @@ class Densifier:
         pixels = unit_range(image) if image.dtype == np.uint8 else image.astype(np.float32, copy=False)
         return Frame(keyframe.name, pixels, keyframe.camera, self._light, self._mask)
 
-    def _aligned(self, keyframe: Keyframe, points: np.ndarray, seen: Seen) -> Alignment:
+    def _aligned(self, keyframe: Keyframe, points: np.ndarray, seen: SeenKeyframe) -> Alignment:
         if not len(points):
             return Alignment(keyframe.name, reason="it observed no points of the map")
         ids, first = np.unique(keyframe.point_ids, return_index=True)
@@ -284,7 +284,10 @@ class Densifier:
         if not known:
             return replace(kept, keyframe=keyframe, points=points)
         return _Kept(
-            keyframe, points, kept.view, self._aligned(keyframe, points, Seen(prediction=kept.view.prediction()))
+            keyframe,
+            points,
+            kept.view,
+            self._aligned(keyframe, points, SeenKeyframe(prediction=kept.view.prediction())),
         )
 
     def _replace(self, renewed: dict[str, _Kept]) -> int:

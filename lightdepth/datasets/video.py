@@ -5,7 +5,7 @@ forward from where it is, or from the keyframe before; a decoded picture is know
 exact after any jump. Frames that the file lacks or that do not decode are refused by number, the others are given.
 
 Pictures are turned as the file says (90, 180, 270 degrees), and keep 16 bits where the file has more than 8.
-Calibration is looked for beside the file: camera.json, light.json, mask.png, else EndoMapper's, as for its frames.
+VideoCalibration is looked for beside the file: camera.json, light.json, mask.png, else EndoMapper's, as for its frames.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import endomapper
 from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask
-from lightdepth.datasets.video_calibration import Calibration, found_calibration
+from lightdepth.datasets.video_calibration import VideoCalibration, found_calibration
 from lightdepth.errors import InputError
 from lightdepth.files.images import unit_range
 from lightdepth.frame import Frame
@@ -329,13 +329,13 @@ class _Load:
         return Frame(f"{i:06d}", image, self.camera, self.light, self.mask, None if np.isnan(time) else time)
 
 
-def _without_camera(path: Path, video: VideoFile) -> Calibration:
+def _without_camera(path: Path, video: VideoFile) -> VideoCalibration:
     """Light and mask beside a video whose camera is given; an endoscope without calibration has neither."""
     try:
         return found_calibration(path, video.width, video.height)
     except InputError:
         mask = path.parent / "mask.png"
-        return Calibration(mask=read_mask(mask) if mask.is_file() else None)
+        return VideoCalibration(mask=read_mask(mask) if mask.is_file() else None)
 
 
 def _index_of(container: Any, stream: Any) -> tuple[_Index | None, list[int | None]]:

@@ -15,7 +15,7 @@ from lightdepth.photometry import PhotometricCalibration
 
 
 @dataclass(frozen=True)
-class Calibration:
+class VideoCalibration:
     """What is known of a video's endoscope; None where nothing was found."""
 
     camera: CameraModel | None = None
@@ -23,7 +23,7 @@ class Calibration:
     mask: np.ndarray | None = None
 
 
-def found_calibration(path: Path, width: int, height: int) -> Calibration:
+def found_calibration(path: Path, width: int, height: int) -> VideoCalibration:
     """camera.json, light.json and mask.png beside a video of this size, else EndoMapper's calibration.
 
     Raises InputError where EndoMapper's tree says that the endoscope has none.
@@ -39,4 +39,4 @@ def found_calibration(path: Path, width: int, height: int) -> Calibration:
     elif (file := endomapper.calibration_file(folder, endomapper.PHOTOMETRY)) is not None:
         light = read_light(file)
     mask = read_mask(folder / "mask.png") if (folder / "mask.png").is_file() else None
-    return Calibration(camera, light, mask)
+    return VideoCalibration(camera, light, mask)

@@ -131,7 +131,7 @@ def cavity() -> TubeConfig:
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """image (H, W, 3) encoded, in [0, 1]; distance (H, W) along the ray, 0 where no wall was met; normals (H, W, 3) in
     camera axes."""
 
@@ -180,13 +180,15 @@ class Tube:
     _make_texture = staticmethod(make_texture)
     _expose = staticmethod(expose)
 
-    def view(self, world_from_cam: np.ndarray, camera: CameraModel, mask: np.ndarray, rng: np.random.Generator) -> View:
+    def view(
+        self, world_from_cam: np.ndarray, camera: CameraModel, mask: np.ndarray, rng: np.random.Generator
+    ) -> RenderedView:
         """What the endoscope sees from a pose (4, 4) [mm]; pixels outside mask (H, W) are black."""
         return self.views(world_from_cam[None], camera, mask, rng)[0]
 
     def views(
         self, world_from_cam: np.ndarray, camera: CameraModel, mask: np.ndarray, rng: np.random.Generator
-    ) -> list[View]:
+    ) -> list[RenderedView]:
         """What the endoscope sees from poses (B, 4, 4) [mm], as one batch: what `view` would give one by one."""
         count = len(world_from_cam)
         owns = rng.spawn(count)
@@ -218,7 +220,7 @@ class Tube:
         ray_z = self._tensor(every_ray[..., 2])
         images = self._expose(image(linear), distance > 0, ray_z, flow, self.sensor, rng, owns)
         parts = (images, distance.cpu().numpy(), image(normals).permute(0, 2, 3, 1).cpu().numpy())
-        return [View(*(np.ascontiguousarray(part[i]) for part in parts)) for i in range(count)]
+        return [RenderedView(*(np.ascontiguousarray(part[i]) for part in parts)) for i in range(count)]
 
     def distance_to_wall(self, points: np.ndarray) -> np.ndarray:
         """Exact distance (n,) [mm] from points (n, 3) to the mesh."""

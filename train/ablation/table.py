@@ -74,7 +74,7 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Table:
+class AblationTable:
     """What was asked for and what came out."""
 
     title: str
@@ -143,7 +143,7 @@ def _overall(ratios: np.ndarray) -> np.ndarray:
     return result
 
 
-def lines(table: Table) -> list[Line]:
+def lines(table: AblationTable) -> list[Line]:
     """Of the rows that were trained; the base first, if it was."""
     first = table.rows[0]
     base = {r.seed: r.ratios(first.told[0]) for r in table.results if r.row == first.name and not r.failed}
@@ -157,7 +157,7 @@ def lines(table: Table) -> list[Line]:
     return found
 
 
-def write_table(table: Table, output: Path, copy: Path | None) -> None:
+def write_table(table: AblationTable, output: Path, copy: Path | None) -> None:
     """ablation.md (and its copy), .csv with every number, .json with what the table says."""
     text = markdown(table)
     output.mkdir(parents=True, exist_ok=True)
@@ -192,7 +192,7 @@ def _summary(line: Line) -> _Summary:
     }
 
 
-def _csv(table: Table) -> str:
+def _csv(table: AblationTable) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["row", "seed", "told", "colons", "metric", "error", "closed_form", "ratio"])
@@ -207,7 +207,7 @@ def _csv(table: Table) -> str:
     return text.getvalue()
 
 
-def markdown(table: Table) -> str:
+def markdown(table: AblationTable) -> str:
     found = lines(table)
     parts = [_head(table), _overall_table(found), _says(found), _closed_form(table)]
     for i, colons in enumerate(table.judged):
@@ -216,7 +216,7 @@ def markdown(table: Table) -> str:
     return "\n".join(part for part in parts if part)
 
 
-def _head(table: Table) -> str:
+def _head(table: AblationTable) -> str:
     seeds = sorted({r.seed for r in table.results})
     tube, (width, height) = table.tube, table.size
     trained = ", ".join(_span(colon_seeds(tube, seed)[0]) for seed in seeds)
@@ -292,7 +292,7 @@ def _says(found: Sequence[Line]) -> str:
     return "\n".join([*text, ""])
 
 
-def _closed_form(table: Table) -> str:
+def _closed_form(table: AblationTable) -> str:
     text = ["## The closed form's own errors", "", "| colons | AbsRel | RMSE mm | MedAE mm |", "|---|---|---|---|"]
     for name, errors in table.results[0].closed_form.items():
         text.append(f"| {name} | {errors['abs_rel']:.4f} | {errors['rmse_mm']:.2f} | {errors['medae_mm']:.2f} |")
@@ -310,7 +310,7 @@ def _set_table(colons: JudgedColons, index: int, found: Sequence[Line]) -> str:
     return "\n".join([*text, ""])
 
 
-def _curves(table: Table) -> str:
+def _curves(table: AblationTable) -> str:
     shown = [r for r in table.results if any(row.curve and row.name == r.row for row in table.rows) and r.curve]
     if not shown:
         return ""
@@ -332,6 +332,6 @@ def _curves(table: Table) -> str:
     return "\n".join([*text, ""])
 
 
-def _failures(table: Table) -> str:
+def _failures(table: AblationTable) -> str:
     failed = [f"- {r.row}, seed {r.seed}: {r.failed}" for r in table.results if r.failed]
     return "\n".join(["## Failed", "", *failed, ""]) if failed else ""

@@ -76,7 +76,7 @@ def let_learn(network: DepthNetwork, what: What, rank: int = 4, generator: torch
     return sum(p.numel() for p in network.parameters() if p.requires_grad)
 
 
-def merge(network: DepthNetwork) -> None:
+def merge_low_rank(network: DepthNetwork) -> None:
     """Puts low-rank additions into the weights that they were added to, so that the network is a plain one again."""
     for part in list(network.modules()):
         if parametrize.is_parametrized(part, "weight"):

@@ -21,7 +21,7 @@ from ..ablation.judge import Judge
 from ..ablation.plan import check, check_apart, plans_of
 from ..ablation.rows import JudgedColons, Row, Settings
 from ..ablation.run import finished, say, train_all
-from ..ablation.table import Table, write_table
+from ..ablation.table import AblationTable, write_table
 from ..parser import training_parser
 from ..running import quiet
 
@@ -73,7 +73,7 @@ def ablate(
         quiet()
         train_all(parser, todo, Judge(judged, common.tube, common.size))
     results = [finished(plan) for plan in plans]
-    made = Table(
+    made = AblationTable(
         title=base.stem,
         rows=rows,
         judged=judged,

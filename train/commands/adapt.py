@@ -25,10 +25,10 @@ from lightdepth.reporting.run import Run, plain, recorded, run_folder, versions
 from ..adapting.card import AdaptedCard, target_loss
 from ..adapting.config import AdaptConfig
 from ..adapting.judging import Outcome, judged, judging_views, map_error
-from ..adapting.module import Adaptation, merge
+from ..adapting.module import Adaptation, merge_low_rank
 from ..adapting.report import Pictures, page
 from ..adapting.target import Target, adaptation, frame_data, read_target, replayed_frames
-from ..callbacks import Diagnosis, DiagnosisConfig, Progress
+from ..callbacks import Diagnosis, DiagnosisConfig, TrainingProgress
 from ..datamodule import FrameDataModule
 from ..running import quiet, report_every
 
@@ -88,7 +88,7 @@ def adapt(
         before = judged(module, data, start, views)
         closed = map_error(views, DeclineModel(details=False))
         _fit(module, data, config.steps, run)
-        merge(module.network)
+        merge_low_rank(module.network)
         adapted = NetworkModel(module.network, size[1], output.name, details=False)
         outcome = Outcome(before, judged(module, data, adapted, views), closed, keep_worse)
         pictures.add(adapted)
@@ -115,7 +115,7 @@ def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> Non
         gradient_clip_val=1.0,
         limit_val_batches=0,
         log_every_n_steps=1,
-        callbacks=[Diagnosis(DiagnosisConfig(), data.names), Progress(run.log, report_every(steps))],
+        callbacks=[Diagnosis(DiagnosisConfig(), data.names), TrainingProgress(run.log, report_every(steps))],
     )
     trainer.fit(module, datamodule=data)
 

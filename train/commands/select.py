@@ -28,9 +28,9 @@ from lightdepth.sparse_map import SparseMap
 from ..selecting.covisibility import (
     LOFTR_NODES,
     SIFT_NODES,
+    FrameVerdict,
     MapRules,
     NodeRules,
-    Verdict,
     published_pairs,
     select_by_map,
     select_by_matching,
@@ -142,28 +142,30 @@ def _paths(output: Path, no_frames: bool, overwrite: bool) -> dict[str, Path]:
     return paths
 
 
-def _by_map(frames: FrameSequence, sparse_map: SparseMap, folder: Path, rules: MapRules) -> tuple[list[Verdict], str]:
+def _by_map(
+    frames: FrameSequence, sparse_map: SparseMap, folder: Path, rules: MapRules
+) -> tuple[list[FrameVerdict], str]:
     pairs = published_pairs(folder, sparse_map) if rules.published else {}
     how = f"covisibility of {sparse_map.source}" + (" by its camerasModel.txt" if pairs else "")
     return select_by_map(frames.names, sparse_map, rules, pairs), how
 
 
-def _counts(verdicts: Sequence[Verdict]) -> str:
+def _counts(verdicts: Sequence[FrameVerdict]) -> str:
     counts = Counter(v.reason for v in verdicts if not v.kept)
     return ", ".join(f"{count} {reason}" for reason, count in counts.most_common()) or "none"
 
 
-def _table(verdicts: Sequence[Verdict]) -> str:
+def _table(verdicts: Sequence[FrameVerdict]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow([f.name for f in fields(Verdict)])
+    writer.writerow([f.name for f in fields(FrameVerdict)])
     for verdict in verdicts:
         row = [int(v) if isinstance(v, bool) else f"{v:.4f}" if isinstance(v, float) else v for v in astuple(verdict)]
         writer.writerow(row)
     return buffer.getvalue()
 
 
-def _sheet(frames: FrameSequence, verdicts: Sequence[Verdict]) -> bytes:
+def _sheet(frames: FrameSequence, verdicts: Sequence[FrameVerdict]) -> bytes:
     """Kept and rejected frames in order, spread over the sequence. Read again: keeping them would fill the memory."""
     rows = []
     for kept in (True, False):
@@ -176,7 +178,12 @@ def _sheet(frames: FrameSequence, verdicts: Sequence[Verdict]) -> bytes:
 
 
 def _page(
-    data: Path, summary: str, how: str, settings: dict[str, object], verdicts: Sequence[Verdict], picture: bytes | None
+    data: Path,
+    summary: str,
+    how: str,
+    settings: dict[str, object],
+    verdicts: Sequence[FrameVerdict],
+    picture: bytes | None,
 ) -> Report:
     page = Report("Frames worth training on")
     page.text(f"{data}, {how}: {summary}.")

@@ -22,7 +22,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import Frame, frame_number
 from lightdepth.sparse_map import SparseMap, Submap, covisibility
 
-from .matching import Agreement, Descriptor, Matcher
+from .matching import Descriptor, MatchAgreement, Matcher
 
 BLUR, NO_MATCHES, FEW_VIEWS, UNREADABLE = "blur", "no matches", "too few views", "unreadable"
 NOT_IN_MAP, FEW_KEYFRAMES = "not in the map", "too few covisible keyframes"
@@ -79,7 +79,7 @@ LOFTR_NODES = NodeRules(
 
 
 @dataclass(frozen=True)
-class Verdict:
+class FrameVerdict:
     """One frame: kept, or the reason why not. `node` counts nodes, or is the submap's id; `similarity` is the largest
     cosine to the node's views, `matches` and `spread` are with its reference view; None where not looked at."""
 
@@ -122,7 +122,7 @@ class _Seen:
     node: int | None = None
     view: bool = False
     similarity: float | None = None
-    agreement: Agreement | None = None
+    agreement: MatchAgreement | None = None
     features: int | None = None
 
 
@@ -133,7 +133,7 @@ def select_by_matching(
     matcher: Matcher,
     rules: NodeRules,
     advance: Callable[[], None] = lambda: None,
-) -> list[Verdict]:
+) -> list[FrameVerdict]:
     """A verdict for every frame, in order. Each frame is read and described once; images are not kept.
 
     A frame that cannot be read is rejected; raises InputError when none can.
@@ -190,9 +190,9 @@ def _into_node(
     return node
 
 
-def _verdict(seen: _Seen, blurred: bool, views_in: Counter[int], good: set[int]) -> Verdict:
+def _verdict(seen: _Seen, blurred: bool, views_in: Counter[int], good: set[int]) -> FrameVerdict:
     matches, spread = seen.agreement or (None, None)
-    found = Verdict(
+    found = FrameVerdict(
         seen.name,
         seen.node in good and not blurred,
         "",
@@ -239,14 +239,14 @@ def select_by_map(
     sparse_map: SparseMap,
     rules: MapRules,
     published: Mapping[int, Mapping[int, set[int]]] | None = None,
-) -> list[Verdict]:
+) -> list[FrameVerdict]:
     """A verdict for every frame, in order. `published` holds, for submaps by id, the covisible frame numbers of each.
 
     A keyframe of several submaps is kept when one of them keeps it. Raises InputError when the map has none of the
     frames.
     """
     numbers = [frame_number(name) for name in names]
-    found: dict[int, Verdict] = {}
+    found: dict[int, FrameVerdict] = {}
     for submap in sparse_map.submaps:
         given = (published or {}).get(submap.id) if rules.published else None
         keyframes = [k.number for k in submap.keyframes]
@@ -255,13 +255,13 @@ def select_by_map(
         kept = {n for n, count in zip(keyframes, others, strict=True) if count >= rules.keyframes}
         for n, count in zip(keyframes, others, strict=True):
             reason = "" if n in kept else FEW_KEYFRAMES
-            _best(found, n, Verdict("", n in kept, reason, submap.id, True, None, int(count)))
+            _best(found, n, FrameVerdict("", n in kept, reason, submap.id, True, None, int(count)))
         order = np.argsort(keyframes)
         for a, b in pairwise(order):
             first, last = keyframes[a], keyframes[b]
             if {first, last} <= kept and covisible[a, b] and last - first <= rules.between:
                 for n in range(first + 1, last):
-                    _best(found, n, Verdict("", True, "", submap.id))
+                    _best(found, n, FrameVerdict("", True, "", submap.id))
     if not found.keys() & set(numbers):
         raise InputError(
             sparse_map.source,
@@ -269,11 +269,11 @@ def select_by_map(
             f"{max(numbers)})",
             "frames and keyframes meet by the number in their names",
         )
-    missing = Verdict("", False, NOT_IN_MAP)
+    missing = FrameVerdict("", False, NOT_IN_MAP)
     return [replace(found.get(n, missing), name=name) for n, name in zip(numbers, names, strict=True)]
 
 
-def _best(found: dict[int, Verdict], number: int, verdict: Verdict) -> None:
+def _best(found: dict[int, FrameVerdict], number: int, verdict: FrameVerdict) -> None:
     before = found.get(number)
     if before is None or (verdict.kept, verdict.matches or 0) > (before.kept, before.matches or 0):
         found[number] = verdict

@@ -21,7 +21,7 @@ from lightdepth.frame import Frame
 _CELLS = 8
 
 
-class Agreement(NamedTuple):
+class MatchAgreement(NamedTuple):
     """matches: that agree with one motion of the camera; spread: share of the image's cells with one of them."""
 
     matches: int
@@ -41,7 +41,7 @@ class Matcher(Protocol):
 
     def count(self, kept: Any) -> int | None: ...
 
-    def agree(self, one: Any, other: Any) -> Agreement: ...
+    def agree(self, one: Any, other: Any) -> MatchAgreement: ...
 
 
 @dataclass(frozen=True)
@@ -105,9 +105,9 @@ class SiftMatcher:
     def count(self, kept: SiftFeatures) -> int:
         return len(kept.rays)
 
-    def agree(self, one: SiftFeatures, other: SiftFeatures) -> Agreement:
+    def agree(self, one: SiftFeatures, other: SiftFeatures) -> MatchAgreement:
         if min(len(one.rays), len(other.rays)) < 8:
-            return Agreement(0, 0.0)
+            return MatchAgreement(0, 0.0)
         cosine = one.descriptors @ other.descriptors.T
         rows = np.arange(len(cosine))
         best = cosine.argmax(1)
@@ -117,7 +117,7 @@ class SiftMatcher:
         matched = near & (cosine.argmax(0)[best] == rows)
         inlier = epipolar_inliers(one.rays[matched], other.rays[best[matched]], self.settings.angle)
         cells = np.unique(other.cells[best[matched]][inlier])
-        return Agreement(int(inlier.sum()), len(cells) / other.cells_in_view)
+        return MatchAgreement(int(inlier.sum()), len(cells) / other.cells_in_view)
 
 
 def epipolar_inliers(one: np.ndarray, other: np.ndarray, angle: float) -> np.ndarray:
@@ -216,7 +216,7 @@ class LoftrMatcher:
     def count(self, kept: _Grey) -> None:
         return None  # LoFTR has no features of one image
 
-    def agree(self, one: _Grey, other: _Grey) -> Agreement:
+    def agree(self, one: _Grey, other: _Grey) -> MatchAgreement:
         import torch
 
         device = self.settings.device
@@ -231,7 +231,7 @@ class LoftrMatcher:
             inside &= kept.mask.numpy()[row, column]
         scale = other.camera.width / other.mask.shape[1]
         cells = np.unique(_cells((places[1][inside] + 0.5) * scale, other.camera))
-        return Agreement(int(inside.sum()), len(cells) / other.cells_in_view)
+        return MatchAgreement(int(inside.sum()), len(cells) / other.cells_in_view)
 
 
 def read_loftr(settings: LoftrSettings) -> Any:
