@@ -265,7 +265,7 @@ SPOILED = {
     "no pose": "frame_data000001.json: camera-pose … missing",
     "scaled": "frame_data000001.json: camera-pose … the pose is not a rotation",
     "NaN": "frame_data000001.json: camera-pose … NaN",
-    "video cut": r"rgb\.mp4: not a video that can be read",
+    "video cut": "rgb.mp4 … not a video that can be read",
     "a frame too few": "keyframe_2 … there is frame data 9, but data/rgb.mp4 has 5 frames",
     "points of another size": "scene_points000001.tiff … float32 of shape (40, 48, 3) … expected float32 X Y Z",
     "points in 8 bits": "scene_points000001.tiff … uint8",

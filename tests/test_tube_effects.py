@@ -31,7 +31,7 @@ from lightdepth.tube.sensor import SensorConfig, draw_sensor, expose
 from lightdepth.tube.shape import make_shape
 from lightdepth.tube.variant import REFLECTANCE, VariantTube, variant_frames
 from train.colons import TubeData, tube_config, tube_scene
-from train.datamodule import FrameDataModule
+from train.datamodule import FrameData
 
 SENSOR_EFFECTS = {
     "exposure": (0.4, 0.4),
@@ -123,7 +123,7 @@ def test_the_effects_cover_every_field_of_the_configuration_that_can_be_off():
 def test_a_training_configuration_names_the_family_of_its_colons_or_their_ranges():
     def tube(given: dict) -> TubeData:
         parser = ArgumentParser(exit_on_error=False)
-        parser.add_class_arguments(FrameDataModule, "data")
+        parser.add_class_arguments(FrameData, "data")
         return parser.instantiate(parser.parse_object({"data": {"tube": {"frames": 1, **given}}})).data.tube
 
     glare = {"scene": {"sensor": {"glare": [0.2, 0.3]}, "texture": {"resolution": 0.4}, "shape": {"step": 1.2}}}

@@ -91,12 +91,10 @@ def judge_maps(
                 meshes.append(ErrorMesh(f"map_{m.trajectory.id:03d}", points, m.triangles, distances.accuracy))
         maps.append(replace(alone, clouds=clouds))
     if not aligned:
-        raise InputError(f"map {maps[0].map_id}", f"{maps[0].error}", "expected one map at least that can be evaluated")
+        raise InputError("the maps", "none could be evaluated", f"map {maps[0].map_id}: {maps[0].error}")
     refused = [m for m in maps if m.surface_error]
     if refused and len(refused) == len(aligned) and truth.surface is not None:
-        raise InputError(
-            f"map {refused[0].map_id}", f"{refused[0].surface_error}", "expected one map at least that can be evaluated"
-        )
+        raise InputError("the maps", "none could be evaluated", f"map {refused[0].map_id}: {refused[0].surface_error}")
     made = {name: pooled(found) for name, found in errors.items() if found}
     trajectory = trajectory_summary(aligned, [m.trajectory for m in models], truth.numbers)
     judged = MapsJudged(

@@ -71,7 +71,7 @@ def write_images(frames: Sequence[Frame], images: Path, masks: Path, config: Sfm
         progress("images", done, len(frames))
     if first is None or meter is None or len(names) < config.min_model_size:
         raise InputError(
-            "the frames", f"{len(names)} of them; a sparse map needs at least {config.min_model_size}", ADVICE
+            "the frames", f"{len(names)} of them", f"a sparse map needs at least {config.min_model_size}; {ADVICE}"
         )
     order, found = np.argsort(list(names)), meter.result()
     measures = Measures(*(getattr(found, f.name)[order] for f in fields(Measures)))

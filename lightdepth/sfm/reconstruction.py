@@ -89,8 +89,9 @@ def sparse_map_from_frames(
         if not count:
             size = f"{written.camera.width}x{written.camera.height}"
             raise InputError(
-                f"no sparse map of {len(frames)} frames of {size} could be made",
-                f"COLMAP connected no {config.min_model_size} of them by {config.min_points} points ({summary(why)})",
+                "the frames",
+                f"no sparse map could be made of {len(frames)} of {size}: COLMAP connected no "
+                f"{config.min_model_size} of them by {config.min_points} points ({summary(why)})",
                 ADVICE,
             )
         _move_models(models, out_folder)

@@ -57,8 +57,8 @@ def adapt(
     """
     if map is None and config.taught:
         raise InputError(
-            "--points",
-            f"{config.points}, --overlap {config.overlap} without --map",
+            "--points, --overlap",
+            f"{config.points}, {config.overlap} without --map",
             "expected a map that teaches where they are above 0",
         )
     arguments = recorded(
