@@ -123,8 +123,6 @@ LEFT_OUT = {"seconds", "started", "command", "versions", "revision", "peak_memor
 """Keys of JSON: times, the machine, and how the run was asked for."""
 PASSED_OVER = ("config.yaml", "log.txt", "timings.csv", "timings.png", "tensorboard", "model.md")
 """Settings and times once more, and the card that model.safetensors holds as well."""
-UNORDERED = ("sinus_paper",)
-"""Open3D gives the vertices of its volume in another order from run to run: they are compared in an order of ours."""
 COUNTED = ("sparse",)
 """Sparse maps are the same bytes from run to run. Under a tolerance they are compared by cameras and by
 counts of points, to one in twenty: a last bit decides which points a mapping keeps."""
@@ -245,9 +243,9 @@ def compared(base: Path, head: Path, name: str, tolerance: float) -> Iterator[st
         yield from _counted(base / name, head / name, name)
         return
     for path in sorted(before & after):
-        said = _difference(base / name / path, head / name / path, tolerance, name in UNORDERED)
+        said = _difference(base / name / path, head / name / path, tolerance)
         if said:
-            yield f"{name}/{path}: {said}"
+            yield f"{name}/{path}: {said if len(said) < 300 else f'{said[:140]} ... {said[-140:]}'}"
 
 
 def _files(folder: Path) -> set[Path]:
@@ -259,7 +257,7 @@ def _files(folder: Path) -> set[Path]:
     }
 
 
-def _difference(base: Path, head: Path, tolerance: float, unordered: bool = False) -> str:
+def _difference(base: Path, head: Path, tolerance: float) -> str:
     """What differs between two files of one kind; empty where nothing does."""
     if base.read_bytes() == head.read_bytes():
         return ""
@@ -272,12 +270,10 @@ def _difference(base: Path, head: Path, tolerance: float, unordered: bool = Fals
         one, other = _numbers(base), _numbers(head)
     except ValueError:
         return "the bytes differ"
-    if unordered and base.suffix == ".ply":
-        one, other = _in_our_order(one), _in_our_order(other)
     if [a.shape for a in one] != [a.shape for a in other]:
         return f"{[a.shape for a in one]} became {[a.shape for a in other]}"
     largest = max((_relative(a, b) for a, b in zip(one, other, strict=True)), default=0.0)
-    if (unordered or base.suffix in (".npz", ".safetensors", ".ckpt")) and not largest:
+    if base.suffix in (".npz", ".safetensors", ".ckpt") and not largest:
         return ""  # the same arrays: the bytes around them hold names of versions
     return "" if 0 < largest <= tolerance else f"the bytes differ; largest relative difference {largest:.3g}"
 
@@ -324,12 +320,6 @@ def _of_ply(path: Path) -> list[np.ndarray]:
         body = body[made.nbytes :]
         arrays += [made[name] for name, _ in properties]
     return arrays
-
-
-def _in_our_order(arrays: list[np.ndarray]) -> list[np.ndarray]:
-    """The vertices of a mesh by their coordinates; of its triangles, which count in the old order, only how many."""
-    order = np.lexsort(arrays[:3])
-    return [a[order] if len(a) == len(order) else np.zeros(len(a)) for a in arrays]
 
 
 def _is_number(word: str) -> bool:
