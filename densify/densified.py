@@ -83,7 +83,9 @@ class Densified:
         if not made:
             reasons = [f"{a.keyframe}: {a.reason}" for r in self.results for a in r.dense.alignments if not a.ok]
             raise InputError(
-                "the maps", "no keyframe of any could be aligned", f"begin with the first: {'; '.join(reasons[:3])}"
+                "the maps",
+                "no keyframe of any could be aligned",
+                f"begin with the first: {'; '.join(reasons[:3]) or 'nothing was fused'}",
             )
         constant = {b.dense.submap.id: b for b in self.baselines}
         records = []

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import inspect
 import sys
+from functools import partial
 from importlib import metadata, util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,11 +89,11 @@ def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
     from lightdepth.command_line.gone_settings import without_gone
     from lightdepth.command_line.options import with_groups
-    from lightdepth.command_line.parsing import parsed
+    from lightdepth.command_line.parsing import fail, parsed
     from lightdepth.command_line.presets import with_preset
 
     parser = verb_parser(function, verb)
-    argv = without_gone(verb, with_preset(verb, argv, parser.error))
+    argv = without_gone(verb, with_preset(verb, argv, partial(fail, parser)))
     return with_groups(function, parser.instantiate(parsed(parser, argv)))
 
 

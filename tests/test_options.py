@@ -304,3 +304,20 @@ if __name__ == "__main__":
     for verb, found in said.items():
         for name, lack in found.items():
             print(f"  {verb} --{name} lacks {lack}")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"fusion: 3", "fusion is 3; expected settings below it"),
+        (b"\xff\xfe\x00", "not YAML: "),
+        (b"", "no settings in it"),
+        (b"- 1", "no settings in it"),
+    ],
+)
+def test_a_file_that_holds_no_settings_is_named_in_one_line(content, said, tmp_path, capsys):
+    (tmp_path / "c.yaml").write_bytes(content)
+    with pytest.raises(SystemExit) as ended:
+        main(["densify", "data", "-o", str(tmp_path / "out"), "--config", str(tmp_path / "c.yaml")])
+    told = capsys.readouterr().err
+    assert ended.value.code == 2 and told.count("\n") == 1 and "c.yaml" in told and said in told

@@ -43,7 +43,8 @@ class BenchConfig:
     first_seed: int = 400
     """Number that seeds the first scene; the others count on from it. Another one draws other colons."""
     wrong_shares: tuple[float, ...] = SHARES["small"]
-    """Shares of wrong map points, each a SLAM export of its own. More shares take longer."""
+    """Shares of wrong map points, each a SLAM export of its own; the screening has one of its
+    own, screening_share. More shares take longer."""
     screening_share: float = 0.3
     """Share of wrong map points of the screening, which is ten times as long as the other scenes and so is judged at
     one share only. A larger one makes it harder."""

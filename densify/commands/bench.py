@@ -59,8 +59,8 @@ def run(
         size: How much is measured: small, two short sequences, minutes; full, eight and a screening, up to an hour.
         first_seed: Number that seeds the first scene; the others count on from it. Seeds below 1000 were never
             trained on. Another one draws other colons.
-        wrong_shares: Shares of wrong map points, each a SLAM export of its own; left out, those of the size. More
-            shares take longer.
+        wrong_shares: Shares of wrong map points, each a SLAM export of its own (the screening always has 0.3); left
+            out, those of the size. More shares take longer.
         checkpoints: Depth models to compare: paths, names of bundled ones, decline (the closed form) or constant.
         recipes: Ways to make surfaces that are compared: full, paper, or both.
         image_size: Width and height of the keyframes, pixels; left out, that of the size. A larger one takes longer.

@@ -64,7 +64,9 @@ class PlayedRun:
         if not any(record.vertices for record in self._records):
             reasons = [f"{p.keyframe}: {p.reason}" for p in played if p.reason]
             raise InputError(
-                "the maps", "no keyframe of any could be aligned", f"begin with the first: {'; '.join(reasons[:3])}"
+                "the maps",
+                "no keyframe of any could be aligned",
+                f"begin with the first: {'; '.join(reasons[:3]) or 'nothing was fused'}",
             )
         write_timings(played, run.folder / "timings.csv")
         (run.folder / "timings.png").write_bytes(timings_picture(played, budget_ms / 1000))

@@ -151,6 +151,8 @@ def parsed(parser: Parser, argv: Sequence[str]) -> Namespace:
             print(parser.help_page(word in HELP_ALL), end="")
             raise SystemExit(0)
     parser.exit_on_error = False
+    for file in _config_files(argv):
+        _check_config(parser, file)
     try:
         return parser.parse_args(spelled(parser, argv))
     except argparse.ArgumentError as error:
@@ -317,6 +319,20 @@ def _config_files(argv: Sequence[str]) -> Iterator[Path]:
         path = following if word == "--config" else word.removeprefix("--config=") if word[:9] == "--config=" else ""
         if path and Path(path).is_file():
             yield Path(path)
+
+
+def _check_config(parser: Parser, file: Path) -> None:
+    """Ends the program where a file is no YAML of settings, or has a value in the place of a group of them."""
+    more = f"Read on: {parser.prog} --help"
+    if not _is_yaml(file):
+        fail(parser, f"{file}: not YAML: expected a line `option: value` for each setting. {more}")
+    found = yaml.safe_load(file.read_text())
+    if not isinstance(found, Mapping):
+        fail(parser, f"{file}: no settings in it; expected a line `option: value` for each. {more}")
+    below = {action.dest.partition(".")[0]: action.dest for action in options(parser) if "." in action.dest}
+    for key, value in found.items():
+        if key in below and value is not None and not isinstance(value, Mapping | str):
+            fail(parser, f"{file}: {key} is {value!r}; expected settings below it, such as {below[key]}. {more}")
 
 
 def _is_yaml(path: Path) -> bool:

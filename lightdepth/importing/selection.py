@@ -31,8 +31,8 @@ class Choice:
     """Time of the last frame to keep, seconds from the first frame; left out, all are kept. A larger one leaves out
     less at the end."""
     blur: float = 0.6
-    """Share of its neighbours' sharpness below which a frame is left out as blurred; 0 keeps all. A larger one leaves
-    out more frames."""
+    """Share of the sharpness of the sharper frames within a second of it below which a frame is left out as
+    blurred; 0 keeps all. A larger one leaves out more frames."""
     max_frames: int | None = None
     """Largest number of frames to keep, spread evenly over the rest. More keep more frames."""
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import lightning.pytorch as pl
 
 from lightdepth.command_line.gone_settings import without_gone
-from lightdepth.command_line.parsing import parsed
+from lightdepth.command_line.parsing import fail, parsed
 from lightdepth.command_line.presets import with_preset
 
 from ..datamodule import FrameDataModule
@@ -25,7 +26,7 @@ def train(argv: list[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if argv is None else argv)
     parser = training_parser()
-    argv = without_gone("train", _with_own_config(with_preset("train", given, parser.error)))
+    argv = without_gone("train", _with_own_config(with_preset("train", given, partial(fail, parser))))
     config = parsed(parser, argv)
 
     output = Path(config.output)
