@@ -18,7 +18,7 @@ from colons import sequence, slam, truth
 from scenes import cylinder, slanted_plane, sphere
 from scipy.spatial import cKDTree
 
-from densify import pipeline
+from densify import fusers
 from densify.config import DensifyConfig
 from densify.evaluation.errors import true_cloud
 from densify.fusion.rectify import RectifyConfig, SurfaceView, surface_view
@@ -90,6 +90,7 @@ class BlockGrid:
     """TsdfVolume's part of VoxelBlockGrid."""
 
     def __init__(self, voxel: float, config: FusionConfig):
+        self.voxel = voxel
         self._o3d = native.open3d()
         core, self._truncation = self._o3d.core, config.truncation
         kinds = (core.float32, core.float32, core.float32)
@@ -207,10 +208,10 @@ def test_colons_that_nothing_was_tuned_on(depth, monkeypatch):
         cloud = true_cloud(frames)
         tree, poses = cKDTree(cloud), {f.number: f.true_world_from_cam for f in frames}
         for way, (view, volume) in WAYS.items():
-            monkeypatch.setattr(pipeline, "surface_view", view)
-            monkeypatch.setattr(pipeline, "TsdfVolume", volume)
+            monkeypatch.setattr(fusers, "surface_view", view)
+            monkeypatch.setattr(fusers, "TsdfVolume", volume)
             if way != "ours":
-                monkeypatch.setattr(pipeline, "contribution", lambda *_: pipeline.Contribution(1.0, 1.0))
+                monkeypatch.setattr(fusers, "contribution", lambda *_: fusers.Contribution(1.0, 1.0))
             dense = densify_submap(submap, sequence(frames), model, DensifyConfig()).dense
             monkeypatch.undo()
             centers = np.stack([k.center for k in submap.keyframes])
