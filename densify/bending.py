@@ -31,8 +31,8 @@ class BendingConfig:
     grids: tuple[int, ...] = (5,)
     """Number of bumps across and down, one number for each level. More let depth bend in finer detail."""
     slope_deviation: float = 0.3
-    """Expected change of log distance per change of log predicted distance; at 0 there is no slope. A larger one lets
-    near and far be stretched more freely."""
+    """Expected size of the slope of the bend: change of the log factor on depth per change of log predicted
+    distance, of either sign; 0 switches the slope off. A larger one lets near and far be stretched more freely."""
     bump_deviation: float = 0.1
     """Expected size of a bump, in log distance. A larger one lets depth bend more strongly."""
 

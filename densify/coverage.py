@@ -29,8 +29,8 @@ class CoverageConfig:
     """Least number of keyframes that must have seen a piece of wall for it to count as seen well. More make that
     claim stricter."""
     weight: float = 1.0
-    """Least weight of these keyframes together; 1 is one keyframe that nothing speaks against. A larger one makes the
-    claim stricter."""
+    """Least weight of all the looks at it together: a keyframe that looks straight at lit wall counts 1, a slanted,
+    dark, saturated or uncertain look less. A larger one makes the claim stricter."""
     min_voxels: float = 5.0
     """Side of a square, in voxels, below whose area weakly seen patches and holes are not listed. A larger one lists
     fewer."""

@@ -38,7 +38,7 @@ def live(
             frames, before the clock starts.
         checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
         rate: Number of keyframes per second that come whether or not the last is done; left out, each comes when the
-            last is done. More leave less time for each.
+            last is done. More leave less time for each: late ones queue, none is dropped.
         budget_ms: Time that a keyframe may take, from its image to the renewed surface, milliseconds. A larger one
             counts more keyframes as in time.
         sfm: how frames are mapped when there is no map

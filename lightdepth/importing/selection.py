@@ -31,8 +31,8 @@ class Choice:
     """Time of the last frame to keep, seconds from the first frame; left out, all are kept. A larger one leaves out
     less at the end."""
     blur: float = 0.6
-    """Share of the sharpness of the sharper frames within a second of it below which a frame is left out as
-    blurred; 0 keeps all. A larger one leaves out more frames."""
+    """A frame is left out as blurred when its sharpness is below this share of that of the sharper frames within
+    about a second before and after; 0 keeps all. A larger one leaves out more."""
     max_frames: int | None = None
     """Largest number of frames to keep, spread evenly over the rest. More keep more frames."""
 

@@ -221,8 +221,8 @@ class MapRules:
     keyframes: int = 2
     """Least number of covisible others that a keyframe must have to be kept. More keep fewer frames."""
     between: int = 40
-    """Number of frames up to which two kept, covisible keyframes that follow each other may be apart for the frames
-    between them to be kept; 1 keeps keyframes only. More keep more frames."""
+    """Largest difference of frame numbers (those in the names) between two kept, covisible keyframes that follow each
+    other for the frames between them to be kept; 1 keeps keyframes only. More keep more frames."""
     published: bool = True
     """Whether the pairs of camerasModel.txt (EndoMapper) are taken, where it is beside the model, instead of
     `points`."""
