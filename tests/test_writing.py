@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 
 import pytest
@@ -52,3 +53,19 @@ def test_file_and_folder_are_on_the_disk_before_and_after_the_rename(tmp_path, m
     (tmp_path / "made" / "in" / "f").write_text("x")
     move_whole(tmp_path / "made", tmp_path / "done")
     assert sorted(map(os.path.basename, order[:3])) == ["f", "in", "made"] and order[3:] == ["rename", str(tmp_path)]
+
+
+def test_a_file_system_that_cannot_sync_folders_loses_nothing_and_a_full_one_is_said(tmp_path, monkeypatch):
+    def failing(code):
+        def fsync(descriptor):
+            raise OSError(code, os.strerror(code))
+
+        return fsync
+
+    monkeypatch.setattr(os, "fsync", failing(errno.EINVAL))
+    write_whole(tmp_path / "a", "x")
+    assert (tmp_path / "a").read_text() == "x"
+    monkeypatch.setattr(os, "fsync", failing(errno.ENOSPC))
+    with pytest.raises(InputError) as refused:
+        write_whole(tmp_path / "a", "y")
+    assert "No space left" in refused.value.found and (tmp_path / "a").read_text() == "x"

@@ -6,6 +6,7 @@ disk too. Files inside a run folder in the making need none of this: the folder 
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
@@ -15,6 +16,10 @@ from lightdepth.errors import InputError
 
 Content = str | bytes | Callable[[Path], object]
 """Text, bytes, or a function that writes a file at the path that it is given (the ending is that of the real one)."""
+
+
+_NOT_HERE = (errno.EINVAL, errno.ENOTSUP)
+"""Some file systems cannot bring a folder to the disk, and say so; a finished run is not lost over it."""
 
 
 def write_whole(path: str | Path, content: Content) -> None:
@@ -59,6 +64,9 @@ def sync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _NOT_HERE:
+            raise
     finally:
         os.close(descriptor)
 
