@@ -40,8 +40,8 @@ class AlignmentConfig:
     loss: Loss = "geman_mcclure"
     """Robust loss of the refinement: geman_mcclure, huber, cauchy or tukey."""
     min_points: int = 8
-    """Least number of observed points with a prediction that a keyframe needs. More make scales safer and leave out
-    more keyframes."""
+    """Least number of observed points with a prediction, withheld ones not counted, that a keyframe needs to be
+    aligned. More make scales safer and leave out more keyframes."""
     min_inliers: int = 6
     """Least number of points within t sigma that a keyframe needs. More make scales safer and leave out more
     keyframes."""

@@ -69,8 +69,8 @@ class JudgingConfig:
     """Distances, mm, up to which a point counts as right in precision, recall and F-score. Larger ones count more
     points."""
     max_depth_mm: float = 100.0
-    """True depth, mm, beyond which pixels take no part in the errors of depth. A larger one judges farther wall
-    too."""
+    """True depth along the camera's axis, mm, beyond which pixels take no part in the errors of predictions (a
+    predict folder; surfaces are judged without it). A larger one judges farther wall too."""
     common: bool = False
     """Judge only the frames that both sides have, where there are others."""
 

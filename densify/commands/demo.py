@@ -38,7 +38,7 @@ def demo(
     Args:
         output: Run folder to make, with the data, the surfaces and the report.
         checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
-        frames: Number of frames to render. More make a longer sequence and take longer.
+        frames: Number of frames to render, .7 mm apart. More make a longer path and take longer.
         seed: Number that draws the colon; no bundled checkpoint was trained on seeds below 1000. Another one draws
             another colon.
         size: Width and height of the images, pixels. A larger one shows finer detail and takes longer.

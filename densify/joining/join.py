@@ -50,8 +50,8 @@ class MergeConfig:
     """Ratios of the two reaches that are tried in turn by surface. More of them find submaps of more different size
     and take longer."""
     max_pairs: int = 60
-    """Number of pairs of submaps compared by looks, and by surface, the nearest in time first. More find more joins
-    and take longer."""
+    """Largest number of pairs of submaps that are compared by looks, and as many again by surface, the nearest in
+    time first. More find more joins and take longer."""
     grain: float = 0.06
     """Spacing of the points by which shapes are compared, as a share of the reach. A larger one is coarser and
     faster."""

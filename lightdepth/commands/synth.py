@@ -27,7 +27,8 @@ class ColonConfig:
     lens: Lens = "c3vd"
     """Lens of the endoscope: pinhole, telescope, fisheye or c3vd."""
     frames: int = 40
-    """Number of frames to render. More make a longer sequence and take longer."""
+    """Number of frames to render, spread evenly over --travel_mm. More lie closer together on the same path, and take
+    longer."""
     size: tuple[int, int] = (320, 256)
     """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
     seed: int = 0

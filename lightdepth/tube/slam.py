@@ -35,7 +35,8 @@ class SlamConfig:
     """Deviation of a point's distance, as a share of it, at 20 mm; it grows in proportion to the distance (error ~
     distance²). A larger one makes a noisier map."""
     pixel_noise: float = 0.5
-    """Deviation of where a point is observed in the image, pixels. A larger one makes noisier observations."""
+    """Deviation of where a point is observed in the image along each axis, pixels. A larger one makes noisier
+    observations."""
     pose_noise_mm: float = 0.05
     """Deviation of a keyframe's place along each axis, mm. A larger one makes noisier poses."""
     pose_noise_deg: float = 0.05
