@@ -15,7 +15,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 from lightdepth.light.fit_on_map import fit_assumed_light, with_light
 from lightdepth.maps import read_map
-from lightdepth.models import DepthModel
+from lightdepth.models import ConstantModel, DepthModel
 from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run
 from lightdepth.sfm.config import SfmConfig
@@ -73,8 +73,15 @@ def made_sparse(
     return found
 
 
-def fitted_light(run: Run, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel) -> FrameSequence:
-    """The frames under the light that the map tells, where theirs is only assumed and the model does better with it."""
+def fitted_light(
+    run: Run, source: SequenceSource, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel, wanted: bool
+) -> FrameSequence:
+    """The frames under the light that the map tells, where theirs is only assumed and the model does better with it.
+
+    They stay as they are where no fit is wanted, where the user gave a light, and for the constant model, which looks
+    at none."""
+    if not wanted or source.light is not None or isinstance(model, ConstantModel):
+        return frames
     light = fit_assumed_light(run, frames, sparse_map, model)
     return frames if light is None else with_light(frames, light)
 

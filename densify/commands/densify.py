@@ -68,8 +68,7 @@ def densify(
     with run_folder(output, "densify", arguments, overwrite) as run:
         sparse_map, frames = map_and_frames(run, source, map, sfm)
         run.hash_inputs(**source.files, map=map)
-        if fit_light and source.light is None and checkpoint != "constant":
-            frames = fitted_light(run, frames, sparse_map, model)
+        frames = fitted_light(run, source, frames, sparse_map, model, fit_light)
         work = Densified.make(frames, sparse_map, model, config, merging if merge else None)
         work.write(run, formats, mm_per_unit)
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))

@@ -219,8 +219,8 @@ def _cut_cells(
             if s >= 0:
                 behinds[x, y], knowns[x, y] = behind[s, at], known[s, at]
             if up >= 0:
-                behinds[x, y] |= (behind[up, at] & 1) << 8
-                knowns[x, y] |= (known[up, at] & 1) << 8
+                behinds[x, y] |= np.int64(behind[up, at] & 1) << 8
+                knowns[x, y] |= np.int64(known[up, at] & 1) << 8
             both &= behinds[x, y] | ~knowns[x, y]
             either |= behinds[x, y] & knowns[x, y]
     n = m = 0
@@ -266,7 +266,8 @@ def _place_vertices(
     base = (8 * ((code >> 2 * _BITS) - REACH) + REACH) << 2 * _BITS
     base |= (8 * ((code >> _BITS & mask) - REACH) + REACH) << _BITS | 8 * ((code & mask) - REACH) + REACH
     for i in range(len(edges)):
-        axis, voxel = edges[i] // 729, edges[i] % 729
+        edge = np.int64(edges[i])
+        axis, voxel = edge // 729, edge % 729
         x, y, z = voxel // 81, voxel // 9 % 9, voxel % 9
         one = around[x >> 3 | y >> 3 << 1 | z >> 3 << 2] * 512 + ((x & 7) << 6 | (y & 7) << 3 | z & 7)
         names[i] = 3 * (base + (x << 2 * _BITS | y << _BITS | z)) + axis
