@@ -35,6 +35,7 @@ from lightdepth.robust import lower_quartile, mad_sigma, robust_weights
 from lightdepth.sparse_map import Keyframe
 
 _STEP = 1e-3  # of log distance, to differentiate by
+_CELLS = 8  # across and down an image: parts whose points share their errors
 _LEAST_SIGMA = 0.01  # of log distance: exact data must not make a single residual decide
 
 
@@ -60,6 +61,10 @@ class AgreementConfig:
     tolerance: float = 1e-3
     """Change in log distance; a round that changes nothing by more is the last. A larger one ends sooner, at a less
     exact solution."""
+    shared_error: float = 0.03
+    """Error, in log distance, that neighbouring points of a map share, as they were tracked together: however many
+    there are in a part of the image, they hold depth no more firmly. A larger one trusts dense maps less; 0 takes every
+    point for a witness of its own."""
     max_gap: float = 0.5
     """Overlap residual, in log distance, from which two pixels count as different tissue (occlusion) and are not
     compared. A larger one compares more pixels."""
@@ -122,7 +127,7 @@ def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, be
     w = np.concatenate([bend.weights for bend in bends])
     most = [_inlier_deviation(_residual(*each)) for each in zip(views, bends, places, strict=True)]
     for _ in range(config.rounds):
-        points = [_point_rows(i, *each) for i, each in enumerate(zip(views, bends, places, most, strict=True))]
+        points = [_point_rows(i, *each, config) for i, each in enumerate(zip(views, bends, places, most, strict=True))]
         rows = points + _overlap_rows(views, bends, places, pairs, config, points)
         step = _step(rows, prior, prior * w, len(views))
         if step is None:
@@ -176,7 +181,9 @@ def _unbent(view: View, bending: BendingConfig) -> Bend:
     weights[0] = np.log(view.scale)
     known = view.log_distance[view.valid]
     middle = float(np.median(known)) if len(known) else 0.0
-    return Bend(bending, middle, weights, (view.keyframe.camera.width, view.keyframe.camera.height))
+    log_range = np.quantile(np.log(view.observed.predicted), (0.02, 0.98)) if len(view.observed) else (-np.inf, np.inf)
+    image_size = view.keyframe.camera.width, view.keyframe.camera.height
+    return Bend(bending, middle, weights, image_size, (float(log_range[0]), float(log_range[1])))
 
 
 @dataclass(frozen=True)
@@ -194,6 +201,22 @@ class _Places:
         return self.bend.basis(o.pixels / self.bend.image_size, np.log(o.predicted))
 
     @cached_property
+    def growth(self) -> np.ndarray:
+        """How many times as large as a middling point's the deviation of each observed point (n,) is: a triangulated
+        distance errs with its square, so its logarithm in proportion to it."""
+        mapped = self.view.observed.mapped
+        ratio = mapped / np.median(mapped)
+        result: np.ndarray = np.sqrt((1 + ratio**2) / 2).clip(max=3)
+        return result
+
+    @cached_property
+    def cells(self) -> np.ndarray:
+        """The part of the image (n,) that each observed point lies in."""
+        place = np.clip((self.view.observed.pixels / self.bend.image_size * _CELLS).astype(int), 0, _CELLS - 1)
+        result: np.ndarray = place[:, 1] * _CELLS + place[:, 0]
+        return result
+
+    @cached_property
     def grid(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of a grid of pixels the unit rays (g, 3), the log predicted distance (g,) and the basis (g, m)."""
         x = self.view.grid(self.samples)
@@ -208,10 +231,13 @@ def _residual(view: View, bend: Bend, places: _Places) -> np.ndarray:
     return result
 
 
-def _point_rows(index: int, view: View, bend: Bend, places: _Places, most: float) -> _Rows:
+def _point_rows(index: int, view: View, bend: Bend, places: _Places, most: float, config: AgreementConfig) -> _Rows:
     residual = _residual(view, bend, places)
-    sigma = min(_inlier_deviation(residual), most)
-    return _Rows(residual, _weight(residual / sigma) / sigma**2, {index: places.at_points})
+    sigma = min(_inlier_deviation(residual), most) * places.growth
+    weight = _weight(residual / sigma) / sigma**2
+    # Points of one cell share an error: together they tell no more than one point with that error would.
+    told = np.bincount(places.cells, weight, _CELLS**2)[places.cells]
+    return _Rows(residual, weight / (1 + told * config.shared_error**2), {index: places.at_points})
 
 
 def _inlier_deviation(residual: np.ndarray) -> float:

@@ -64,6 +64,8 @@ class Bend(Brief):
     log_middle: float
     weights: np.ndarray
     image_size: tuple[int, int]
+    log_range: tuple[float, float] = (-np.inf, np.inf)
+    """least and largest log predicted distance that points speak for; the slope goes no further"""
 
     @property
     def scale(self) -> float:
@@ -76,7 +78,7 @@ class Bend(Brief):
         if not self.config.on:
             return parts[0]
         if self.config.slope_deviation:
-            parts.append((log_distance - self.log_middle)[:, None])
+            parts.append((np.clip(log_distance, *self.log_range) - self.log_middle)[:, None])
         for n in self.config.grids:
             across, down, mean = _bumps(x[:, 0], n), _bumps(x[:, 1], n), _mean(n)
             parts.append((down[:, :, None] * across[:, None, :] - np.outer(mean, mean)).reshape(len(x), -1))
@@ -94,7 +96,8 @@ class Bend(Brief):
         if not self.config.on:
             return field
         if self.config.slope_deviation:
-            field += np.float32(self.weights[1]) * (log_distance - np.float32(self.log_middle))
+            within = np.clip(log_distance, *np.float32(self.log_range))
+            field += np.float32(self.weights[1]) * (within - np.float32(self.log_middle))
             used = 2
         for n in self.config.grids:
             down = _bumps((np.arange(height) + 0.5) / height, n)

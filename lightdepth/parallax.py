@@ -1,0 +1,245 @@
+"""Distance by the images alone: what a textured pixel does from one keyframe to others whose poses are known.
+
+A map's points and a network's distances can err alike. The images are a witness of their own: at the right distance
+the patch around a pixel looks in other keyframes as it looks here. Notation: pixel p of keyframe i on the unit ray r,
+L the log distance that is guessed for it; hypotheses d_k = exp(L + s_k), s_k evenly spaced on either side of 0. Each
+hypothesis carries p, and two places beside it, into keyframe j; the three projections are an affine map of the patch
+around p. Its zero-mean normalised cross-correlation (NCC) with what j shows, averaged over the j that see it, is the
+score of s_k; the best one, to a part of a step by a parabola, is the distance (plane sweep; Collins 1996). A pixel
+speaks only where the best score is high, no other hypothesis comes near it, and it falls off to both sides: without
+texture, or without parallax, it does not.
+
+The guess decides where is looked, and how a patch is slanted; not what is found. The poses are taken as they are: one
+factor on all of them, or a slow drift of it, cannot be seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from lightdepth.brief import Brief
+from lightdepth.camera import CameraModel
+from lightdepth.frame import Frame
+from lightdepth.observations import ObservedDistances, sample_distance
+from lightdepth.prediction import DepthPrediction
+from lightdepth.sparse_map import Keyframe, Submap
+
+_SATURATED = 0.97  # of the brightest value: highlights wander with the camera
+_BESIDE = 2.0  # pixels from the middle of a patch to the places that tell its slant
+
+
+@dataclass(frozen=True)
+class ParallaxConfig:
+    """How the images measure distance."""
+
+    on: bool = True
+    """Whether distances measured between images judge the surface; switched off, only the map's points do."""
+    width: int = 320
+    """Width that images are compared at, pixels; smaller ones stay. A larger one measures finer and takes longer."""
+    across: int = 24
+    """Number of cells across the image, of each of which the pixel with most texture is tried. More give more
+    distances and take longer."""
+    neighbours: int = 4
+    """Number of keyframes that each is compared with. More make distances surer and take longer."""
+    patch: int = 7
+    """Side of the patches that are compared, pixels, an odd number. A larger one needs less texture and blurs edges."""
+    angle: float = 12.0
+    """Parallax that neighbours are chosen for, degrees between their rays to shared points. A larger one measures
+    finer, between images that look less alike."""
+    least_angle: float = 2.0
+    """Parallax below which a neighbour is not compared, degrees. A larger one leaves out more pairs."""
+    least_score: float = 0.7
+    """Least correlation of a patch with its likeness, 1 at most, for its distance to count. A larger one gives fewer,
+    surer distances."""
+
+
+@dataclass(frozen=True, repr=False)
+class Look(Brief):
+    """A keyframe's image as it is compared: brightness (h, w) float32 in log, what of it is usable (h, w), and the
+    keyframe under the camera of that size."""
+
+    keyframe: Keyframe
+    brightness: np.ndarray
+    usable: np.ndarray
+
+    @classmethod
+    def of(cls, keyframe: Keyframe, frame: Frame, width: int) -> Look:
+        """Of a keyframe and its frame, whose camera is the keyframe's."""
+        image, valid, camera = frame.image, frame.valid, keyframe.camera
+        clear = image.max(2) < _SATURATED * max(float(image.max()), 1e-6)
+        gray = (0.3 * image[..., 0] + 0.7 * image[..., 1]).astype(np.float32)
+        if camera.width > width:
+            size = (width, max(1, round(camera.height * width / camera.width)))
+            camera = camera.resized(*size)
+            gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+            valid, clear = (
+                cv2.resize(m.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99 for m in (valid, clear)
+            )
+        light = np.log(np.clip(gray, 0, None) + 4 / 255).astype(np.float32)
+        return cls(replace(keyframe, camera=camera), light, valid & clear)
+
+
+def textured(look: Look, config: ParallaxConfig) -> np.ndarray:
+    """Pixels (n, 2) of most texture, one of each cell that has any."""
+    height, width = look.usable.shape
+    reach = config.patch // 2 + 1
+    usable = cv2.erode(look.usable.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8), borderValue=0) > 0
+    strength = cv2.cornerMinEigenVal(cv2.GaussianBlur(look.brightness, (0, 0), 0.8), 5, ksize=3)
+    strength = np.where(usable, strength, 0)
+    rows = np.linspace(0, height, max(2, round(config.across * height / width)) + 1).astype(int)
+    columns = np.linspace(0, width, config.across + 1).astype(int)
+    found = []
+    for top, bottom in zip(rows[:-1], rows[1:], strict=True):
+        for left, right in zip(columns[:-1], columns[1:], strict=True):
+            cell = strength[top:bottom, left:right]
+            if cell.size and cell.max() > 0:
+                row, column = np.unravel_index(int(cell.argmax()), cell.shape)
+                found.append((left + column + 0.5, top + row + 0.5))
+    return np.array(found).reshape(-1, 2)
+
+
+def parallax_neighbours(submap: Submap, config: ParallaxConfig) -> list[list[int]]:
+    """For each keyframe the others that it is compared with: those that share points with it at a parallax nearest to
+    the wanted one, as many from before it as from after it where there are."""
+    rows = [submap.rows_of(submap.observed_points(k)[0])[0] for k in submap.keyframes]
+    sees = np.zeros((len(rows), len(submap.points)), bool)
+    for row, seen in zip(sees, rows, strict=True):
+        row[seen] = True
+    found = []
+    for i, keyframe in enumerate(submap.keyframes):
+        off = {}
+        for j, other in enumerate(submap.keyframes):
+            points = submap.points[sees[i] & sees[j]]
+            if j == i or len(points) < 8:
+                continue
+            here, there = (p / np.linalg.norm(p, axis=1).clip(min=1e-12)[:, None] for p in
+                           (points - keyframe.center, points - other.center))  # fmt: skip
+            angle = float(np.degrees(np.median(np.arccos(np.clip((here * there).sum(1), -1, 1)))))
+            if angle >= config.least_angle:
+                off[j] = abs(np.log(angle / config.angle))
+        before, after = (sorted((j for j in off if (j > i) == later), key=off.__getitem__) for later in (False, True))
+        half = config.neighbours // 2
+        chosen = before[:half] + after[:half]
+        rest = sorted(before[half:] + after[half:], key=off.__getitem__)
+        found.append(sorted(chosen + rest[: config.neighbours - len(chosen)]))
+    return found
+
+
+def measured(
+    look: Look, others: Sequence[Look], prediction: DepthPrediction, scale: float, config: ParallaxConfig
+) -> ObservedDistances:
+    """Distances by parallax, as if they were points of the map: `mapped` is what the images say, `predicted` what the
+    prediction says, whose `scale` times it is the guess; pixels are those of the prediction's camera. Empty where no
+    pixel speaks. `point_ids` number the pixels that were tried.
+    """
+    pixels = textured(look, config)
+    if not others or not len(pixels):
+        return _none(0)
+    sweep = _Sweep.of(look, pixels, prediction, scale, config.patch)
+    total, count = np.zeros(sweep.shape), np.zeros(sweep.shape)
+    for other in others:
+        score, seen = sweep.compared(look, other)
+        total += score
+        count += seen
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(count > 0, total / count, -1.0)
+    step, speaks = _best(mean, config.least_score)
+    speaks &= sweep.known
+    camera = prediction.camera
+    at = pixels[speaks] * (camera.width / look.keyframe.camera.width, camera.height / look.keyframe.camera.height)
+    rays, _ = camera.unproject(at)
+    predicted, known = sample_distance(prediction, at)
+    mapped = np.exp(sweep.guess[speaks] + step[speaks])
+    return ObservedDistances(np.flatnonzero(speaks), mapped, predicted, at, rays).subset(known)
+
+
+def _none(n: int) -> ObservedDistances:
+    return ObservedDistances(np.zeros(n, int), np.zeros(n), np.zeros(n), np.zeros((n, 2)), np.zeros((n, 3)))
+
+
+_STEP, _STEPS_EACH_WAY, _APART, _FALL_AT = 0.025, 24, 5, 6
+_MARGIN, _FALL = 0.1, 0.1
+_HYPOTHESES = _STEP * np.arange(-_STEPS_EACH_WAY, _STEPS_EACH_WAY + 1)
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """The patches of one look: their values less the mean (n, q), and of every hypothesis the three places of each in
+    camera axes (n, k, 3, 3)."""
+
+    guess: np.ndarray
+    known: np.ndarray
+    own: np.ndarray
+    places: np.ndarray
+    grid: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.guess), len(_HYPOTHESES)
+
+    @classmethod
+    def of(cls, look: Look, pixels: np.ndarray, prediction: DepthPrediction, scale: float, patch: int) -> _Sweep:
+        camera: CameraModel = look.keyframe.camera
+        three = (pixels[:, None] + np.array([[0, 0], [_BESIDE, 0], [0, _BESIDE]])).reshape(-1, 2)
+        full = prediction.camera
+        distance, valid = sample_distance(prediction, three * (full.width / camera.width, full.height / camera.height))
+        rays, inside = camera.unproject(three)
+        distance = scale * distance.reshape(-1, 3)
+        known = (valid & inside).reshape(-1, 3).all(1) & (distance > 0).all(1)
+        distance = np.where(known[:, None], distance, 1.0)
+        places = rays.reshape(-1, 1, 3, 3) * (distance[:, None] * np.exp(_HYPOTHESES)[:, None])[..., None]
+        half = patch // 2
+        grid = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), -1).reshape(-1, 2)
+        own = _sampled(look.brightness, pixels[:, None] + grid)
+        return cls(np.log(distance[:, 0]), known, own - own.mean(1, keepdims=True), places, grid.astype(float))
+
+    def compared(self, look: Look, other: Look) -> tuple[np.ndarray, np.ndarray]:
+        """NCC (n, k) of every hypothesis with what another keyframe shows, 0 where it does not see it, and whether it
+        does (n, k)."""
+        other_from_this = other.keyframe.cam_from_map @ np.linalg.inv(look.keyframe.cam_from_map)
+        moved = self.places.reshape(-1, 3) @ other_from_this[:3, :3].T + other_from_this[:3, 3]
+        projected, seen = other.keyframe.camera.project(moved)
+        projected = np.where(seen[:, None], projected, -1e3).reshape(*self.shape, 3, 2)
+        middle = projected[:, :, 0]
+        beside = (projected[:, :, 1:] - middle[:, :, None]) / _BESIDE
+        at = middle[:, :, None] + self.grid @ beside
+        height, width = other.usable.shape
+        inside = seen.reshape(*self.shape, 3).all(2) & ((at >= 0.5) & (at <= (width - 0.5, height - 0.5))).all((2, 3))
+        cell = np.clip(middle.astype(int), 0, (width - 1, height - 1))
+        inside &= other.usable[cell[..., 1], cell[..., 0]]
+        values = _sampled(other.brightness, at.reshape(self.shape[0], -1, 2)).reshape(*self.shape, -1)
+        values -= values.mean(2, keepdims=True)
+        size = np.sqrt((values**2).sum(2)) * np.sqrt((self.own**2).sum(1))[:, None]
+        score = np.einsum("nkq,nq->nk", values, self.own) / np.maximum(size, 1e-9)
+        return np.where(inside, score, 0.0), inside
+
+
+def _sampled(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values (n, m) float32 at pixels (n, m, 2), bilinear."""
+    place = (at - 0.5).astype(np.float32)
+    result: np.ndarray = cv2.remap(image, place[..., 0], place[..., 1], cv2.INTER_LINEAR)
+    return result
+
+
+def _best(score: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """The best hypothesis (n,) in log distance from the guess, and whether it can be told (n,)."""
+    n, count = score.shape
+    index, every = score.argmax(1), np.arange(n)
+    top = score[every, index]
+
+    def beside(offset: int) -> np.ndarray:
+        result: np.ndarray = score[every, np.clip(index + offset, 0, count - 1)]
+        return result
+
+    near = np.abs(np.arange(count) - index[:, None]) < _APART
+    rival = np.where(near, -1.0, score).max(1)
+    fall = top - np.maximum(beside(-_FALL_AT), beside(_FALL_AT))
+    speaks = (index >= 3) & (index < count - 3) & (top > least) & (top - rival > _MARGIN) & (fall > _FALL)
+    left, right = beside(-1), beside(1)
+    bend = np.minimum(left - 2 * top + right, -1e-9)
+    part = np.clip(0.5 * (left - right) / bend, -0.5, 0.5)
+    return _HYPOTHESES[index] + _STEP * part, speaks
