@@ -66,6 +66,7 @@ def test_a_view_reads_its_distance_at_the_place_asked_for_and_not_half_a_pixel_b
 
 def test_the_pixels_that_are_compared_lie_evenly_over_the_image():
     x = facing(0, 20.0).grid(16)
+    assert len(x) == 16 * 13
     np.testing.assert_allclose([x.mean(0), x.min(0) + x.max(0)], [[0.5, 0.5], [1, 1]], atol=1e-12)
 
 
