@@ -10,7 +10,7 @@ from raising import refused
 from scenes import ENDOMAPPER, cylinder
 from test_sparse_map import pose
 
-from densify.alignment import Alignment, AlignmentConfig, align, bent
+from densify.alignment import Alignment, AlignmentConfig, align, bent, spread_deg
 from densify.bending import Bend, BendingConfig
 from lightdepth.observations import ObservedDistances, observed_distances
 from lightdepth.sparse_map import Keyframe, Submap
@@ -199,3 +199,30 @@ def test_the_median_of_the_ratios_is_taken_as_it_is_and_wrong_points_pull_it():
     assert found.scale > lmeds.scale * 1.005 and found.sigma > lmeds.sigma
     with refused(where="alignment.estimator", found="'mean'"):
         AlignmentConfig(estimator="mean")
+
+
+def test_the_90th_percentile_of_distance_is_the_inliers_and_wrong_points_do_not_reach_farther():
+    pairs = observed(wrong=0.3)
+    found = align("1", pairs, AlignmentConfig())
+    inlier = np.isin(pairs.point_ids, found.inlier_ids)
+    assert found.range_90 == pytest.approx(np.quantile(pairs.mapped[inlier], 0.9))
+    assert found.range_90 < 0.8 * np.quantile(pairs.mapped, 0.9)
+
+
+def test_a_bend_s_inliers_are_within_t_sigma_of_the_logarithm_and_its_sigma_is_a_length():
+    pairs = observed(wrong=0.2, noise=0.01)
+    flat = Bend(BendingConfig(grids=(2,)), 3.0, np.array([np.log(0.3), 0, 0, 0, 0, 0]), (100, 100))
+    found = bent(align("1", pairs, AlignmentConfig()), flat, pairs, AlignmentConfig())
+    residual = np.abs(np.log(pairs.mapped / pairs.predicted / 0.3))
+    sigma = 1.4826 * np.median(residual)
+    assert found.sigma == pytest.approx(sigma * np.median(pairs.mapped))
+    np.testing.assert_array_equal(found.inlier_ids, pairs.point_ids[residual <= 2.5 * sigma])
+
+
+def test_exactly_as_many_inliers_as_wanted_are_enough():
+    assert align("1", observed(10, noise=0.0), AlignmentConfig(min_inliers=10)).ok
+
+
+def test_two_bundles_of_rays_spread_by_their_angle_to_the_middle():
+    angle = np.radians([0.0, 0.0, 10.0, -10.0])
+    assert spread_deg(np.stack([np.sin(angle), 0 * angle, np.cos(angle)], 1)) == pytest.approx(np.sqrt(50))

@@ -106,7 +106,10 @@ def test_lengths_go_by_one_power_areas_by_two():
     assert record["holes"][0]["area"] == scaled.holes[0].area and record["well_area"] == scaled.well
 
 
-@pytest.mark.parametrize("config, well", [({}, 1.0), ({"views": 6}, 0.0), ({"weight": 3.5}, 0.0)])
+@pytest.mark.parametrize(
+    "config, well",
+    [({}, 1.0), ({"views": 5}, 1.0), ({"views": 6}, 0.0), ({"weight": 3.0}, 1.0), ({"weight": 3.5}, 0.0)],
+)
 def test_well_is_what_the_settings_say(config, well):
     dense = ball(INWARD, np.full(len(VERTICES), 3.0), np.full(len(VERTICES), 5))
     assert coverage(dense, CoverageConfig(**config)).well_share == pytest.approx(well)
@@ -119,6 +122,19 @@ def test_what_is_smaller_than_a_few_voxels_is_not_listed():
     dense = ball(INWARD, np.full(len(VERTICES), 3.0), views)
     assert coverage(dense).weak == ()
     assert len(coverage(dense, CoverageConfig(min_voxels=0.1)).weak) == 1
+
+
+def test_patches_are_listed_largest_first():
+    views = np.where((VERTICES[:, 2] > 8) | (VERTICES[:, 2] < -4), 1, 5)
+    first, second = coverage(ball(INWARD, np.full(len(VERTICES), 3.0), views)).weak
+    assert first.area > 2 * second.area and first.center[2] < 0 < second.center[2]
+
+
+def test_a_nearer_camera_that_looks_away_does_not_show_a_hole():
+    """The hole is at z 9.2, behind the camera at z 9.5 and before that at 0."""
+    dense = ball(INWARD[POLAR > 0.4], np.full(len(VERTICES), 3.0), np.full(len(VERTICES), 5))
+    near = replace(dense, submap=replace(dense.submap, keyframes=(look(0, 3), look(9.5, 8))))
+    assert coverage(near).holes[0].frame == 3
 
 
 def test_patches_hang_together_by_vertices():

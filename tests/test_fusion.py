@@ -122,6 +122,15 @@ def test_every_vertex_knows_how_many_views_saw_it_and_with_what_weight():
     assert mesh.weights[right & (mesh.vertices[:, 0] > 9)].max() < 1.5
 
 
+@pytest.mark.parametrize(("z", "views"), [(20.1, 2), (20.3, 1)])
+def test_a_vertex_was_seen_by_the_views_that_saw_the_voxel_nearest_to_it(z, views):
+    """Voxels lie at depths 20.0 and 20.4. A second wall, before this one, is spoken for to depth 20.02 only."""
+    mesh = fused([plane(z), plane(20.02 - 6 * 0.4)], voxel=0.4)
+    middle = np.linalg.norm(mesh.vertices[:, :2], axis=1) < 6
+    assert middle.sum() > 100 and np.abs(mesh.vertices[middle, 2] - z).max() < 0.1
+    assert (mesh.views[middle] == views).all()
+
+
 def test_two_views_that_disagree_meet_by_their_weights():
     assert np.median(fused([plane(20.0), plane(20.6)]).vertices[:, 2]) == pytest.approx(20.3, abs=0.05)
     assert np.median(fused([plane(20.0), plane(20.6, color=1.0)]).vertices[:, 2]) == pytest.approx(20.2, abs=0.04)

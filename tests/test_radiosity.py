@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import C3VD, ENDOMAPPER, PINHOLE, cylinder, ray_tensors, slanted_plane, sphere
+from scenes import C3VD, ENDOMAPPER, PINHOLE, Scene, cylinder, ray_tensors, slanted_plane, sphere
 
 from lightdepth.camera import Pinhole
 from lightdepth.frame import to_batch
@@ -24,6 +24,15 @@ def lit(reflectance: float, mu: float = 2.767):
 
 def indirect(scene, reflectance: float = 0.6, mu: float = 2.767, **options) -> torch.Tensor:
     return indirect_irradiance(scene.distance, scene.rays, scene.valid, lit(reflectance, mu), **options)
+
+
+def sphere_from(aside: float, radius: float = 10.0) -> Scene:
+    """The inside of a sphere whose centre is that far beside the camera."""
+    rays, valid = ray_tensors(CAMERA)
+    middle = torch.tensor([aside, 0.0, 0.0], dtype=torch.float64).reshape(1, 3, 1, 1)
+    along = (rays * middle).sum(1, keepdim=True)
+    distance = along + (along.square() + radius**2 - aside**2).sqrt()
+    return Scene(CAMERA, rays, valid, torch.where(valid, distance, 1.0), (middle - distance * rays) / radius)
 
 
 def fibonacci_sphere(n: int) -> torch.Tensor:
@@ -97,6 +106,21 @@ def test_indirect_light_in_a_sphere_is_the_constant_of_the_integrating_sphere(ca
     first = reflectance * float((solid * fall).sum()) / (4 * math.pi)
     assert float(found.mean()) == pytest.approx(first * (1 + share + share**2 + share**3), rel=0.15)
     assert float(found.std() / found.mean()) < 0.05
+
+
+@pytest.mark.parametrize("aside", [0.0, 5.0, 8.0])
+def test_indirect_light_in_a_sphere_does_not_hang_on_the_slant_at_which_its_wall_is_seen(aside):
+    """From anywhere in it: the mean over the sphere of what its parts get, which is a sum over true areas."""
+    scene = sphere_from(aside)
+    found = indirect(scene, mu=0.0, bounces=1, pool=4)[scene.valid]
+    cosine = -(scene.normals * scene.rays).sum(1, keepdim=True)
+    areas = scene.distance.square() * pixel_solid_angle(scene.rays) / cosine * scene.valid
+    direct = cosine / scene.distance.square()
+    share = 0.6 / (4 * math.pi * 10.0**2)
+    first = share * float((areas * direct).sum())
+    expected = first * (1 + share * float(areas.sum()))
+    print(f"{aside}: {float(found.median()) / expected:.3f} of the closed form")
+    assert float(found.median()) == pytest.approx(expected, rel=0.03)
 
 
 def test_zero_reflectance_gives_zero():

@@ -10,7 +10,7 @@ from raising import refused
 from scenes import C3VD, ENDOMAPPER
 from scipy.spatial.transform import Rotation
 
-from lightdepth.sparse_map import Keyframe, SparseMap, Submap, check_rigid, covisibility
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap, check_rigid, covisibility, typical_distance
 
 
 def pose(seed: int = 0, shift: float = 1.0) -> np.ndarray:
@@ -87,6 +87,28 @@ def test_covisibility_counts_the_points_that_two_keyframes_share():
     assert covisibility(whole).tolist() == [[10, 9, 8], [9, 9, 8], [8, 8, 8]]
     sets = [set(whole.observed_points(k)[0].tolist()) for k in whole.keyframes]
     assert covisibility(whole).tolist() == [[len(a & b) for b in sets] for a in sets]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wrong_points_that_are_too_far_do_not_make_the_typical_distance_larger(seed):
+    """With 30 % of them it is the median distance of the right ones."""
+    rng = np.random.default_rng(seed)
+    whole, distance = submap(1000, 1), rng.uniform(10, 40, 1000)
+    keyframe, rays = whole.keyframes[0], rng.uniform(-0.3, 0.3, (1000, 3)) + (0, 0, 1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    seen = distance * np.where(np.arange(1000) < 300, rng.uniform(4, 9, 1000), 1)
+    points = (rays * seen[:, None] - keyframe.cam_from_map[:3, 3]) @ keyframe.cam_from_map[:3, :3]
+    found = typical_distance(replace(whole, points=points))
+    assert found == pytest.approx(np.median(distance[300:]), rel=0.03)
+
+
+def test_every_observation_counts_for_the_typical_distance_and_a_map_without_any_is_refused():
+    whole = submap(30, 2)
+    distances = [np.linalg.norm(whole.observed_points(k)[1] - k.center, axis=1) for k in whole.keyframes]
+    assert typical_distance(whole) == pytest.approx(np.quantile(np.concatenate(distances), 0.35))
+    blind = replace(whole.keyframes[0], point_ids=np.zeros(0, int), pixels=np.zeros((0, 2)))
+    with refused(where="map 0", found="no keyframe observes any of its points"):
+        typical_distance(replace(whole, keyframes=(blind,)))
 
 
 def transposed() -> np.ndarray:

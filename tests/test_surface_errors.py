@@ -22,6 +22,7 @@ from densify.evaluation.errors import (
     surface_errors,
     thinned,
     true_cloud,
+    true_points,
 )
 from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import JudgedMap
@@ -156,6 +157,20 @@ def test_a_sphere_s_depth_is_triangulated_without_holes_and_a_fold_is_not_bridge
     half = np.where(np.arange(40) < 20, 20.0, 0.0).astype(np.float32) * np.ones((30, 1), np.float32)
     assert len(depth_triangles(replace(frame, true_distance=half), 1)[1]) == 2 * 19 * 29
     assert len(depth_triangles(frame, 2)[0]) == 20 * 15
+
+
+def test_what_the_mask_hides_is_no_true_point_and_a_jump_of_a_fifth_is_no_wall():
+    camera = PINHOLE.resized(40, 30)
+    mask = np.ones((30, 40), bool)
+    mask[:, :10] = False
+    frame = replace(sphere(camera, 20.0).frame(), true_world_from_cam=np.eye(4))
+    assert true_points(replace(frame, mask=mask), 1)[1].sum() == 30 * 30
+    fold = np.where(np.arange(40) < 20, 20.0, 24.0).astype(np.float32) * np.ones((30, 1), np.float32)
+    assert len(depth_triangles(replace(frame, true_distance=fold), 1)[1]) == 2 * 38 * 29
+
+
+def test_the_spacing_of_a_cloud_is_the_distance_of_neighbours():
+    assert truth_of(np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0], [6, 0, 0]])).spacing_mm == 1.0
 
 
 # What must not matter

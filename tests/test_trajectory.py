@@ -127,6 +127,15 @@ def test_submaps_are_averaged_as_climb_does_and_pooled_over_their_poses():
     assert few.climb_ate_mm is None and few.climb_submaps == 0
 
 
+def test_climb_counts_a_submap_from_a_hundred_poses_on():
+    source, target = case(0, 100)
+    for poses_of_it, counted in ((100, 1), (99, 0)):
+        whole = trajectory(source[:poses_of_it])
+        found = trajectory_summary([align_trajectory(whole, poses(target))], [whole], range(100))
+        assert found.climb_submaps == counted
+        assert found.climb_ate_mm == (pytest.approx(found.rms_ate_mm) if counted else None)
+
+
 def test_a_frame_in_two_submaps_is_localised_once_and_keyframes_alone_tell_no_share():
     source, target = case(0, 20)
     twice = [trajectory(source, map_id=0), trajectory(source, map_id=1)]
