@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from densify.evaluation.errors import surface_errors as surface_errors
     from densify.evaluation.trajectory import align_trajectory as align_trajectory
     from densify.fusion.volume import TsdfVolume as TsdfVolume
+    from densify.judging.config import JudgeConfig as JudgeConfig
     from densify.live.densifier import Densifier as Densifier
     from densify.pipeline import densify as densify
     from densify.similarity import Similarity as Similarity
@@ -29,6 +30,7 @@ _HOMES = {
     "DenseMap": "densify.dense_map",
     "Densifier": "densify.live.densifier",
     "DensifyConfig": "densify.config",
+    "JudgeConfig": "densify.judging.config",
     "LiveConfig": "densify.config",
     "Similarity": "densify.similarity",
     "TsdfVolume": "densify.fusion.volume",

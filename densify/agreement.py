@@ -30,7 +30,7 @@ from scipy.sparse.linalg import spsolve
 from densify.bending import Bend, BendingConfig
 from lightdepth.brief import Brief
 from lightdepth.observations import ObservedDistances
-from lightdepth.prediction import DepthPrediction
+from lightdepth.prediction import DepthPrediction, log_distance_at
 from lightdepth.robust import lower_quartile, mad_sigma, robust_weights
 from lightdepth.sparse_map import Keyframe
 
@@ -88,12 +88,7 @@ class View(Brief):
         height, width = prediction.distance.shape
         rows = min(rows, height)
         size = (max(1, round(width * rows / height)), rows)
-        # A model may call a distance valid that has no logarithm; it would spoil its neighbours.
-        known = prediction.valid & (prediction.distance > 0) & np.isfinite(prediction.distance)
-        log = np.log(np.where(known, prediction.distance, 1)).astype(np.float32)
-        share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        log = cv2.resize(log, size, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
-        return cls(keyframe, observed, log, share > 0.99, scale)
+        return cls(keyframe, observed, *log_distance_at(prediction, size), scale)
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Log predicted distance (n,) at x (n, 2) in [0, 1]², and where it is known (n,)."""
@@ -117,7 +112,7 @@ class View(Brief):
 
 def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, bending: BendingConfig) -> list[Bend]:
     """The field of every view. `shared` (n, n) counts the points that two views share (sparse_map.covisibility)."""
-    bends = [_unbent(view, bending) for view in views]
+    bends = [unbent(view, bending) for view in views]
     if not config.on:
         return bends
     unknowns = len(bending.precision)
@@ -176,7 +171,8 @@ def _step(rows: Sequence[_Rows], prior: np.ndarray, pull: np.ndarray, views: int
     return step if np.isfinite(step).all() else None
 
 
-def _unbent(view: View, bending: BendingConfig) -> Bend:
+def unbent(view: View, bending: BendingConfig) -> Bend:
+    """A view's own scale, as a field that does not bend."""
     weights = np.zeros(len(bending.precision))
     weights[0] = np.log(view.scale)
     known = view.log_distance[view.valid]

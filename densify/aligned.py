@@ -11,6 +11,7 @@ from densify.agreement import View, agree
 from densify.alignment import Alignment, AlignmentConfig, align, bent
 from densify.bending import Bend
 from densify.config import MethodConfig
+from densify.contradiction import ContradictionConfig, uncontradicted
 from densify.predictions import SeenKeyframe
 from lightdepth.observations import ObservedDistances, observed_distances, unobserved
 from lightdepth.sparse_map import Keyframe, Submap
@@ -24,12 +25,12 @@ class AlignedKeyframe:
     alignment: Alignment
     observed: ObservedDistances | None = None
     """all points that it observed, with their predicted distances; None where its image is not there"""
-    withheld: ObservedDistances | None = None
-    """those of them that took no part in the alignment"""
     view: View | None = None
     """what the agreement of keyframes sees of it"""
     bend: Bend | None = None
     """the field that the agreement found for it, also where the alignment does not trust it"""
+    alone: Alignment | None = None
+    """its one scale, from before it was bent; None where nothing was"""
     stays: np.ndarray | None = None
     """share (h, w) in {0, 1} of its pixels, coarsely, that no nearer keyframe contradicts; None is all of them"""
 
@@ -43,22 +44,17 @@ def align_alone(
     submap: Submap,
     seen: SeenKeyframe,
     config: AlignmentConfig,
-    withhold: float = 0.0,
-    seed: int = 0,
 ) -> AlignedKeyframe:
-    """One scale for one keyframe, by the points that it observed less a share that is withheld."""
+    """One scale for one keyframe, by the points that it observed."""
     prediction = seen.prediction
     if prediction is None:
         return AlignedKeyframe(keyframe, Alignment(keyframe.name, reason=seen.reason))
     observed = observed_distances(keyframe, submap, prediction)
-    used, withheld = split_withheld(observed, withhold, [seed, submap.id, keyframe.number])
-    alignment = align(keyframe.name, used, config)
-    if not alignment.ok and len(used) < config.min_points:
+    alignment = align(keyframe.name, observed, config)
+    if not alignment.ok and len(observed) < config.min_points:
         lost = unobserved(keyframe, submap, prediction)
         alignment = replace(alignment, reason="; ".join(filter(None, [alignment.reason, lost])))
-    return AlignedKeyframe(
-        keyframe, alignment, observed, withheld, View.of(keyframe, used, prediction, alignment.scale)
-    )
+    return AlignedKeyframe(keyframe, alignment, observed, View.of(keyframe, observed, prediction, alignment.scale))
 
 
 def align_together(
@@ -72,16 +68,23 @@ def align_together(
     bends = agree(views, shared[np.ix_(rows, rows)], config.agreement, config.bending) if rows else []
     together = list(keyframes)
     for i, view, bend in zip(rows, views, bends, strict=True):
-        alignment = together[i].alignment
+        alone = alignment = together[i].alignment
         if config.agreement.on:
-            alignment = bent(alignment, bend, view.observed, config.alignment)
-        together[i] = replace(together[i], alignment=alignment, bend=bend)
+            alignment = bent(alone, bend, view.observed, config.alignment)
+        together[i] = replace(together[i], alignment=alignment, bend=bend, alone=alone)
     return together
 
 
-def split_withheld(
-    observed: ObservedDistances, share: float, seed: Sequence[int]
-) -> tuple[ObservedDistances, ObservedDistances]:
-    """The points that take part in the alignment, and those kept back to judge the surface by."""
-    back = np.random.default_rng(list(seed)).random(len(observed)) < share
-    return observed.subset(~back), observed.subset(back)
+def uncontradicted_keyframes(
+    keyframes: Sequence[AlignedKeyframe], shared: np.ndarray, config: ContradictionConfig
+) -> list[AlignedKeyframe]:
+    """The same keyframes, each with the map of its pixels that no nearer keyframe contradicts."""
+    used = [(i, k.view, k.bend) for i, k in enumerate(keyframes) if config.on and k.view and k.bend]
+    rows, views, bends = zip(*used, strict=True) if used else ((), (), ())
+    stays = dict(zip(rows, uncontradicted(views, bends, shared[np.ix_(rows, rows)], config), strict=True))
+    return [replace(k, stays=stays.get(i)) for i, k in enumerate(keyframes)]
+
+
+def unread(keyframes: Sequence[AlignedKeyframe]) -> dict[str, str]:
+    """Keyframes whose image is missing or unreadable, with the reason."""
+    return {k.keyframe.name: k.alignment.reason for k in keyframes if k.view is None}

@@ -76,7 +76,8 @@ class Alignment(Brief):
     """map distance ≈ scale · predicted distance. sigma in map units; ids of the points on either side of t sigma.
 
     `ok`, or else `reason` says why the keyframe is left out. `range_90` is the 90th percentile of the distance of the
-    LMedS inliers. `bend` is the smooth field that the depth is bent by, where there is one.
+    LMedS inliers. `bend` is the smooth field that the depth is bent by, where there is one; `unbent_because` says why
+    one that was found is not used.
     """
 
     keyframe: str
@@ -88,6 +89,7 @@ class Alignment(Brief):
     range_90: float = 0.0
     reason: str = ""
     bend: Bend | None = None
+    unbent_because: str = ""
 
     @property
     def ok(self) -> bool:

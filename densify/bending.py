@@ -96,7 +96,8 @@ class Bend(Brief):
         if not self.config.on:
             return field
         if self.config.slope_deviation:
-            within = np.clip(log_distance, *np.float32(self.log_range))
+            low, high = self.log_range
+            within = np.clip(log_distance, np.float32(low), np.float32(high))
             field += np.float32(self.weights[1]) * (within - np.float32(self.log_middle))
             used = 2
         for n in self.config.grids:

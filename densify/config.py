@@ -12,6 +12,7 @@ from densify.contradiction import ContradictionConfig
 from densify.coverage import CoverageConfig
 from densify.fusion.rectify import RectifyConfig
 from densify.fusion.volume import FusionConfig
+from densify.judging.config import JudgeConfig
 from lightdepth.errors import InputError
 
 Recipe = Literal["full", "paper"]
@@ -78,11 +79,8 @@ class DensifyConfig(OfflineConfig):
 
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
     """when wall counts as seen well"""
-    withhold: float = 0.2
-    """Share of each keyframe's observed points that takes no part in the alignment, so that the surface can be judged
-    by them. A larger one judges more surely, and aligns on fewer points."""
-    seed: int = 0
-    """Number that draws the withheld points of each keyframe. Another one withholds other points."""
+    judge: JudgeConfig = field(default_factory=JudgeConfig)
+    """how the result is judged, and bends that make it worse are undone (--judge.on false leaves that out)"""
     recipe: Recipe = "full"
     """How dense maps are made: full, or paper, which is one LMedS scale per keyframe, one undistorted pinhole image,
     and a plain TSDF. It has no agreement, bending, contradiction or rectification, and takes no settings of these."""
@@ -91,8 +89,6 @@ class DensifyConfig(OfflineConfig):
     are made again. More save time and change nothing else."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.withhold < 1:
-            raise InputError("withhold", f"{self.withhold}", "expected a share of at least 0 and below 1")
         if self.recipe not in ("full", "paper"):
             raise InputError("recipe", f"{self.recipe!r} is not known", "expected full or paper")
         unused = [name for name, left_out in vars(_LEFT_OUT).items() if getattr(self, name) != left_out]

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
 from densify.joining import MergeConfig, Merged, joined_name, merge
+from densify.judging.verdict import Verdict, worst
 from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify
 from densify.predictions import SeenKeyframe
-from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.models import DepthModel
@@ -22,11 +22,10 @@ from lightdepth.sparse_map import SparseMap, Submap
 
 @dataclass
 class Densified:
-    """The densify step as verbs use it: results, the same with a constant distance, pictures taken on the way."""
+    """The densify step as verbs use it: results, and pictures taken on the way."""
 
     model: str
     results: Sequence[SubmapResult]
-    baselines: Sequence[SubmapResult]
     gallery: Gallery
     merged: Merged | None = None
 
@@ -48,24 +47,23 @@ class Densified:
                 bar.advance()
 
             results = densify(frames, sparse_map, model, config, show)
-        baselines: Sequence[SubmapResult] = []
-        if config.withhold:
-            with Progress("Constant distance, for comparison", count) as bar:
-                # At one scale per keyframe: bent to the points of the map, a constant would be the map's merit.
-                baselines = densify(
-                    frames, sparse_map, load_model("constant"), config.rigid(), lambda *_: bar.advance()
-                )
         merged = None
         if merging is not None and len(results) > 1:
             with Progress("Joining submaps", count) as bar:
                 merged = merge(results, frames, model, config, merging, lambda *_: bar.advance())
-        return cls(model.name, results, baselines, gallery, merged)
+        return cls(model.name, results, gallery, merged)
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """On all of them: the worst; None where nothing was judged."""
+        return worst([r.judgement.verdict for r in self.results if r.judgement is not None])
 
     def notes(self, of: str, frames: FrameSequence, light_fit: Mapping[str, object] | None) -> list[str]:
         """Sentences for the page: what the surfaces were made of (`of`), under which light, and what is weak."""
         light = frames[0].light
         under = f"gamma {light.gamma:.3g}, mu {light.mu:.3g} ({light.source})"
-        notes = [f"{of}; depth by {self.model}; light of the frames: {under}."]
+        notes = [f"Verdict: {self.verdict}."] if self.verdict is not None else []
+        notes += [f"{of}; depth by {self.model}; light of the frames: {under}."]
         notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
         submaps = [result.dense.submap for result in self.results]
         weak = [str(s.id) for s in submaps if s.weak_visibility]
@@ -87,12 +85,13 @@ class Densified:
                 "no keyframe of any could be aligned",
                 f"begin with the first: {'; '.join(reasons[:3]) or 'nothing was fused'}",
             )
-        constant = {b.dense.submap.id: b for b in self.baselines}
+        if self.verdict is not None:
+            run.log(f"verdict: {self.verdict}")
+            run.record["verdict"] = plain(self.verdict)
         records = []
         for result in self.results:
-            dense, withheld = result.dense, result.withheld
+            dense, judgement = result.dense, result.judgement
             name = f"map_{dense.submap.id:03d}"
-            baseline = constant.get(dense.submap.id)
             records.append(
                 {
                     "map": dense.submap.id,
@@ -102,8 +101,8 @@ class Densified:
                     "voxel": dense.voxel,
                     "seen_share": result.seen_share,
                     "coverage": result.coverage and result.coverage.scaled(mm_per_unit or 1.0).record(),
-                    "withheld": withheld and asdict(withheld),
-                    "withheld_constant": baseline and baseline.withheld and asdict(baseline.withheld),
+                    "verdict": judgement and plain(judgement.verdict),
+                    "judge": judgement and judgement.record(),
                     "seconds": result.seconds,
                 }
             )
@@ -115,10 +114,10 @@ class Densified:
             replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, mm_per_unit)
             text = f"{name}: {len(dense.aligned)} of {len(dense.alignments)} keyframes aligned, "
             text += f"{len(dense.vertices)} vertices"
-            if withheld is not None:
-                text += f"; withheld points {_share(withheld.median)} from the surface"
-                if baseline is not None and baseline.withheld is not None:
-                    text += f" (constant distance {_share(baseline.withheld.median)})"
+            if judgement is not None:
+                text += "; " + judgement.summary
+                if len(self.results) > 1:
+                    run.log(f"{name}: {judgement.verdict}")
             if result.coverage is not None:
                 text += f"; {result.coverage.well_share:.0%} of the wall seen well, {len(result.coverage.holes)} holes"
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
@@ -141,7 +140,3 @@ class Densified:
             run.log(f"{text}{len(dense.aligned)} of {len(dense.alignments)} keyframes aligned")
         for map_id, reason in merged.meeting.alone().items():
             run.log(f"map {map_id} joins no other: {reason}")
-
-
-def _share(value: float) -> str:
-    return f"{value:.1%}" if value < float("inf") else "infinitely far"

@@ -26,8 +26,8 @@ from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged
 from densify.evaluation.suite import Suite, present, read_suite
 from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.evaluation.truth import read_truth
-from densify.evaluation.withheld import WithheldOfMap, withheld_errors
 from densify.inputs import check_unit, map_and_frames
+from densify.judging.withheld import Withheld, WithheldOfMap, withheld_errors
 from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
@@ -207,13 +207,15 @@ def _made_dense(
     """The maps made dense as `densify` makes them, with its defaults, and written; maps of which no surface was made
     keep their sparse points. And what is said of the withheld points, with the constant distance's."""
     work = Densified.make(frames, sparse_map, model, DensifyConfig())
-    constant = {b.dense.submap.id: b.withheld for b in work.baselines}
     withheld = []
     for result in work.results:
         map_id = result.dense.submap.id
         if len(result.dense.triangles):
             result.dense.write(folder / f"map_{map_id:03d}")
-        if result.withheld is not None:
-            withheld.append(WithheldOfMap(map_id, result.withheld, constant.get(map_id)))
+        judged = result.judgement
+        if judged is not None and judged.hidden is not None:
+            bent = judged.blocks.constant_bent
+            constant = Withheld(judged.blocks.count, bent, float("inf"), 0.0, bent)
+            withheld.append(WithheldOfMap(map_id, judged.hidden, constant))
     dense = {m.trajectory.id: m for m in (dense_models(read_run(folder)) if map_folders(folder) else [])}
     return [dense.get(m.trajectory.id, m) for m in sparse_models(sparse_map)], withheld

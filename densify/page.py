@@ -68,13 +68,12 @@ class Gallery:
 def densify_page(
     title: str,
     results: Sequence[SubmapResult],
-    baselines: Sequence[SubmapResult],
     gallery: Gallery,
     notes: Sequence[str],
     figures: Sequence[MapFigures] | None = None,
     mm_per_unit: float | None = None,
 ) -> Report:
-    """The whole page. `baselines` are the same maps densified with a constant distance, or nothing; `figures` their
+    """The whole page. `figures` are their
     errors where there is truth; areas are in mm² where the unit of the maps is known."""
     page = Report(title)
     for note in notes:
@@ -100,8 +99,8 @@ def densify_page(
     page.table(headers, rows)
     if any(r.coverage for r in results):
         _coverage(page, results, mm_per_unit)
-    if any(r.withheld for r in results):
-        _withheld(page, results, baselines)
+    if any(r.judgement for r in results):
+        _judged(page, results)
     for result in results:
         _submap(page, result, gallery)
     _times(page, results)
@@ -183,21 +182,38 @@ def _coverage(page: Report, results: Sequence[SubmapResult], mm_per_unit: float 
         page.table(["", "", f"area [{unit}]", "frame"], regions)
 
 
-def _withheld(page: Report, results: Sequence[SubmapResult], baselines: Sequence[SubmapResult]) -> None:
-    page.heading("Withheld points")
+def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
+    page.heading("Agreement")
     page.text(
-        "A share of each keyframe's observed points took no part in the alignment. Their distance from the surface, "
-        "along their rays and relative to their distance from the camera, judges the surface without any truth. "
-        "The same road with a constant distance tells how much of it the predicted depth has earned. "
-        "A ray that misses the surface counts as infinitely far."
+        "How far the distances of single keyframes are from distances that they were not fitted to, as a share, in the "
+        "median. This is agreement, not error: map and images may be wrong together with the surface, by one factor or "
+        "a slow drift of it above all. The map: points of blocks of wall, hidden from every keyframe in turn; points "
+        "drawn one by one lie beside points that were used, and flatter. The images: distances by parallax between "
+        "keyframes. A constant distance gets the same help, one scale or a bend: what the prediction does not win by, "
+        "the map has earned. The surface itself uses every point."
     )
     rows: list[list[Any]] = []
-    constant = {b.dense.submap.id: b.withheld for b in baselines}
     for result in results:
-        for name, w in (("this depth", result.withheld), ("constant distance", constant.get(result.dense.submap.id))):
-            if w is not None:
-                rows.append([f"map {result.dense.submap.id}", name, w.points, w.median, w.p90, w.miss])
-    page.table(["", "depth", "points", "median", "90th percentile", "share that misses"], rows)
+        j, name = result.judgement, f"map {result.dense.submap.id}"
+        if j is None:
+            continue
+        for what, c in (("map, hidden blocks", j.blocks), ("map, drawn points", j.drawn), ("images", j.images)):
+            if c.count:
+                rows.append([name, what, c.count, c.one_scale, c.bent, c.constant_one_scale, c.constant_bent])
+    headers = ["", "agreement with", "distances", "one scale", "bent", "constant, one scale", "constant, bent"]
+    page.table(headers, rows)
+    for result in results:
+        j = result.judgement
+        if j is None:
+            continue
+        text = f"Map {result.dense.submap.id}: {j.verdict}."
+        if j.surface is not None:
+            met = "" if j.surface.median_met is None else f" {100 * j.surface.median_met:.1f} % in the median;"
+            text += f" The surface against the images:{met} {100 * j.surface.miss:.0f} % of their rays miss it."
+        undone = [a for a in result.dense.alignments if a.unbent_because]
+        if undone:
+            text += f" {len(undone)} keyframes keep one scale; {undone[0].keyframe}: {undone[0].unbent_because}."
+        page.text(text)
 
 
 def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:
@@ -227,7 +243,7 @@ def mesh_pictures(dense: DenseMap, name: str = "") -> list[tuple[bytes, str]]:
     if dense.weights is not None:
         colors = np.where(seen_well(dense)[:, None], SEEN_WELL, SEEN_WEAKLY)
         pictures.append(
-            (png(mesh_picture(dense.vertices, dense.triangles, colors)), "SeenKeyframe well (green), weakly (orange)")
+            (png(mesh_picture(dense.vertices, dense.triangles, colors)), "Seen well (green), weakly (orange)")
         )
     return pictures
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-import numpy as np
-
-from densify.aligned import AlignedKeyframe, align_alone, align_together
+from densify.aligned import AlignedKeyframe, align_alone, align_together, uncontradicted_keyframes, unread
 from densify.config import DensifyConfig
-from densify.contradiction import ContradictionConfig, uncontradicted
 from densify.coverage import Coverage, coverage, seen_share
 from densify.dense_map import DenseMap
-from densify.evaluation.withheld import Withheld
 from densify.fusers import fuser_for
+from densify.judgement import Judge
+from densify.judging.verdict import Judgement
 from densify.predictions import Clock, Predictions, Predictor, SeenKeyframe
 from lightdepth.brief import Brief
 from lightdepth.datasets import FrameSequence
@@ -27,8 +25,8 @@ class SubmapResult(Brief):
 
     dense: DenseMap
     """the surface, and the alignments that it rests on"""
-    withheld: Withheld | None = None
-    """how well it explains the withheld points; None where none were withheld"""
+    judgement: Judgement | None = None
+    """how well it agrees with what it was not made from, and the verdict; None where nothing was judged"""
     seen_share: float = 0.0
     """share of the masked pixels of the aligned keyframes that look at the surface"""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -73,21 +71,27 @@ def densify_submap(
 ) -> SubmapResult:
     """The dense map of one submap, in the order of the paper's method section.
 
-    Each keyframe's distance is predicted and aligned by itself, to the map points that it observed; then all keyframes
-    are aligned together, and what nearer ones contradict is left out. The aligned keyframes are fused into one surface.
-    The points that were withheld from the alignment judge it. Raises InputError where no keyframe observes a point.
+    Each keyframe's distance is predicted and aligned by itself, to the map points that it observed; then all are
+    aligned together, bends that make things worse are undone, and what nearer keyframes contradict is left out. What
+    remains is fused into one surface, and judged. Raises InputError where no keyframe observes a point.
     """
     clock, fuser = Clock(), fuser_for(submap, config)
+    judge, shared = Judge(submap, config), covisibility(submap)
     predictions = Predictions(frames, model, config.keep_mb, clock)
     keyframes = []
     for keyframe in submap.keyframes:
         seen = predictions.of(keyframe)
         with clock("align"):
-            keyframes.append(align_alone(keyframe, submap, seen, config.alignment, config.withhold, config.seed))
+            keyframes.append(align_alone(keyframe, submap, seen, config.alignment))
+        with clock("judge"):
+            judge.see(keyframe, seen)
     if config.recipe == "full":
         with clock("agree"):
-            shared = covisibility(submap)
-            keyframes = _uncontradicted(align_together(keyframes, shared, config), shared, config.contradiction)
+            keyframes = align_together(keyframes, shared, config)
+        with clock("judge"):
+            keyframes = judge.braked(keyframes)
+        with clock("agree"):
+            keyframes = uncontradicted_keyframes(keyframes, shared, config.contradiction)
     for i, each in enumerate(keyframes):
         seen = predictions.of(each.keyframe)
         keyframes[i] = each = each if seen.prediction else each.unread(seen.reason)
@@ -101,17 +105,5 @@ def densify_submap(
     with clock("cover"):
         covered = None if dense.weights is None else coverage(dense, config.coverage)
     with clock("judge"):
-        withheld = Withheld.of(dense, [(k.keyframe, k.withheld) for k in keyframes if k.withheld is not None])
-        share = seen_share(dense, frames)
-    unread = {each.keyframe.name: each.alignment.reason for each in keyframes if each.view is None}
-    return SubmapResult(dense, withheld, share, dict(clock), unread, covered)
-
-
-def _uncontradicted(
-    keyframes: list[AlignedKeyframe], shared: np.ndarray, config: ContradictionConfig
-) -> list[AlignedKeyframe]:
-    """The same keyframes, each with the map of its pixels that no nearer keyframe contradicts."""
-    used = [(i, k.view, k.bend) for i, k in enumerate(keyframes) if config.on and k.view and k.bend]
-    rows, views, bends = zip(*used, strict=True) if used else ((), (), ())
-    stays = dict(zip(rows, uncontradicted(views, bends, shared[np.ix_(rows, rows)], config), strict=True))
-    return [replace(k, stays=stays.get(i)) for i, k in enumerate(keyframes)]
+        judgement, share = judge.judgement(dense, keyframes), seen_share(dense, frames)
+    return SubmapResult(dense, judgement, share, dict(clock), unread(keyframes), covered)

@@ -71,7 +71,7 @@ class Look(Brief):
         """Of a keyframe and its frame, whose camera is the keyframe's."""
         image, valid, camera = frame.image, frame.valid, keyframe.camera
         clear = image.max(2) < _SATURATED * max(float(image.max()), 1e-6)
-        gray = (0.3 * image[..., 0] + 0.7 * image[..., 1]).astype(np.float32)
+        gray: np.ndarray = (0.3 * image[..., 0] + 0.7 * image[..., 1]).astype(np.float32)
         if camera.width > width:
             size = (width, max(1, round(camera.height * width / camera.width)))
             camera = camera.resized(*size)
@@ -133,8 +133,8 @@ def measured(
     look: Look, others: Sequence[Look], prediction: DepthPrediction, scale: float, config: ParallaxConfig
 ) -> ObservedDistances:
     """Distances by parallax, as if they were points of the map: `mapped` is what the images say, `predicted` what the
-    prediction says, whose `scale` times it is the guess; pixels are those of the prediction's camera. Empty where no
-    pixel speaks. `point_ids` number the pixels that were tried.
+    prediction, of the look's size, says; `scale` times that is the guess. `pixels` (n, 2) are in [0, 1]², over the
+    image's size. Empty where no pixel speaks. `point_ids` number the pixels that were tried.
     """
     pixels = textured(look, config)
     if not others or not len(pixels):
@@ -149,12 +149,11 @@ def measured(
         mean = np.where(count > 0, total / count, -1.0)
     step, speaks = _best(mean, config.least_score)
     speaks &= sweep.known
-    camera = prediction.camera
-    at = pixels[speaks] * (camera.width / look.keyframe.camera.width, camera.height / look.keyframe.camera.height)
-    rays, _ = camera.unproject(at)
-    predicted, known = sample_distance(prediction, at)
+    camera, at = look.keyframe.camera, pixels[speaks]
     mapped = np.exp(sweep.guess[speaks] + step[speaks])
-    return ObservedDistances(np.flatnonzero(speaks), mapped, predicted, at, rays).subset(known)
+    predicted = np.exp(sweep.guess[speaks]) / scale
+    x = at / (camera.width, camera.height)
+    return ObservedDistances(np.flatnonzero(speaks), mapped, predicted, x, camera.unproject(at)[0])
 
 
 def _none(n: int) -> ObservedDistances:
@@ -185,8 +184,7 @@ class _Sweep:
     def of(cls, look: Look, pixels: np.ndarray, prediction: DepthPrediction, scale: float, patch: int) -> _Sweep:
         camera: CameraModel = look.keyframe.camera
         three = (pixels[:, None] + np.array([[0, 0], [_BESIDE, 0], [0, _BESIDE]])).reshape(-1, 2)
-        full = prediction.camera
-        distance, valid = sample_distance(prediction, three * (full.width / camera.width, full.height / camera.height))
+        distance, valid = sample_distance(prediction, three)
         rays, inside = camera.unproject(three)
         distance = scale * distance.reshape(-1, 3)
         known = (valid & inside).reshape(-1, 3).all(1) & (distance > 0).all(1)

@@ -64,6 +64,25 @@ class DepthPrediction(Brief):
         np.savez_compressed(path, meta=np.array(json.dumps(meta)), **arrays)
 
 
+def log_distance_at(prediction: DepthPrediction, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Log distance (h, w) float32 at a smaller size (width, height), each the mean of the pixels that it merges, and
+    where all of these are known (h, w)."""
+    import cv2  # not at the top: whoever only reads predictions has no use for it
+
+    # A model may call a distance valid that has no logarithm; it would spoil its neighbours.
+    known = prediction.valid & (prediction.distance > 0) & np.isfinite(prediction.distance)
+    log = np.log(np.where(known, prediction.distance, 1)).astype(np.float32)
+    share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    log = cv2.resize(log, size, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
+    return log, share > 0.99
+
+
+def shrunk(prediction: DepthPrediction, camera: CameraModel) -> DepthPrediction:
+    """The distance alone, under its camera at a smaller size."""
+    log, known = log_distance_at(prediction, (camera.width, camera.height))
+    return DepthPrediction(prediction.name, np.exp(log), known, camera, prediction.source, prediction.unit)
+
+
 def read_prediction(path: str | Path) -> DepthPrediction:
     """A prediction from its .npz. Raises InputError when it is not one."""
     try:

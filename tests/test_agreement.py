@@ -138,7 +138,7 @@ def test_depth_maps_that_err_each_in_its_own_way_are_not_flattened_so_that_they_
     """Flat maps agree best: with few points, overlap must help and not win."""
     views, predictions = erring(30, 0.3, 0.2)
     alone, together = (agree(views, scene(0.3)[3], c, BendingConfig()) for c in (ALONE, AgreementConfig()))
-    assert min(bend.weights[1] for bend in together) > -0.5  # -1 is flat
+    assert min(bend.weights[1] for bend in together) > -0.55  # -1 is flat
     assert np.mean(errors(together, predictions, 0.3)) < 0.9 * np.mean(errors(alone, predictions, 0.3))
 
 

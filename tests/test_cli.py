@@ -148,7 +148,11 @@ def test_a_run_has_a_surface_for_every_map_a_report_and_its_figures(run):
     assert record["checkpoint"] == "decline" and record["unit"] == "map units" and record["failures"] == []
     for row in record["maps"]:
         assert row["aligned"] == row["keyframes"] > 3 and row["vertices"] > 1000 and 0 < row["seen_share"] <= 1
-        assert row["withheld"]["points"] > 50 and row["withheld_constant"]["points"] > 50
+        assert row["judge"]["blocks"]["count"] > 50 and row["judge"]["blocks"]["constant_bent"] > 0
+        assert row["verdict"]["colour"] in ("green", "amber", "red") and row["verdict"]["sentence"]
+    assert record["verdict"] in [row["verdict"] for row in record["maps"]]
+    (first,) = [line for line in (run / "log.txt").read_text().splitlines() if "verdict: " in line]
+    assert record["verdict"]["sentence"] in first
     assert set(record["inputs"]) == {"data", "map"}
     assert not list(run.parent.glob(".dense-*"))
 
@@ -194,11 +198,11 @@ def test_evaluate_judges_the_gap_between_two_maps_by_the_known_similarities(run,
     assert not (tmp_path / "gap2").exists()
 
 
-def test_evaluate_without_truth_shows_the_withheld_points_beside_a_constant_distance(run, tmp_path, capsys):
+def test_evaluate_without_truth_shows_the_agreement_with_the_map_beside_a_constant_distance(run, tmp_path, capsys):
     assert lightdepth("evaluate", run, "-o", tmp_path / "e") == 0
     record = json.loads((tmp_path / "e" / "metrics.json").read_text())
     maps = json.loads((run / "run.json").read_text())["maps"]
-    assert [w["withheld"]["median"] for w in record["withheld"]] == [m["withheld"]["median"] for m in maps]
+    assert [w["withheld"]["median"] for w in record["withheld"]] == [m["judge"]["hidden"]["median"] for m in maps]
     text = (tmp_path / "e" / "metrics.md").read_text()
     assert "no truth needed" in text and text.count("constant distance") == len(maps)
     assert text in capsys.readouterr().out
@@ -214,10 +218,10 @@ def test_evaluate_without_anything_to_compare_with_is_refused(data, run, tmp_pat
 
 def test_a_map_s_known_scale_gives_millimetres_and_other_formats_on_request(run, data, tmp_path):
     argv = ["--map", data / "slam", "--checkpoint", "decline", "--mm-per-unit", 4, "--formats", "[ply, glb, obj]"]
-    assert lightdepth("densify", data, *argv, "--withhold", 0, "--output", tmp_path / "mm") == 0
+    assert lightdepth("densify", data, *argv, "--judge.on", "false", "--output", tmp_path / "mm") == 0
     assert {"mesh.ply", "mesh.glb", "mesh.obj"} <= set(left_in(tmp_path / "mm" / "map_000"))
     record = json.loads((tmp_path / "mm" / "run.json").read_text())
-    assert record["unit"] == "mm" and record["maps"][0]["withheld"] is None
+    assert record["unit"] == "mm" and record["maps"][0]["judge"] is None
 
 
 @pytest.mark.parametrize("output", ["-o", "--output", "--output="])
@@ -239,7 +243,8 @@ def test_the_share_of_wrong_points_can_be_given_either_way(tmp_path):
 
 
 def test_options_come_from_a_file_too_and_the_command_line_wins(data, tmp_path):
-    (tmp_path / "c.yaml").write_text("checkpoint: decline\nwithhold: 0.0\nalignment:\n  t: 3.5\nfusion:\n  far: 1.5\n")
+    settings = {"checkpoint": "decline", "judge": {"on": False}, "alignment": {"t": 3.5}, "fusion": {"far": 1.5}}
+    (tmp_path / "c.yaml").write_text(json.dumps(settings))
     argv = ["--config", tmp_path / "c.yaml", "--fusion.far", 1.25]
     assert lightdepth("densify", data, *argv, "--map", data / "slam", "-o", tmp_path / "out") == 0
     arguments = json.loads((tmp_path / "out" / "run.json").read_text())["arguments"]
@@ -271,7 +276,7 @@ BAD_INPUT = {
     "no such checkpoint": (["predict", "DATA", "--checkpoint", "best"], "best: no such checkpoint"),
     "no such map": (["densify", "DATA", "--map", "NOWHERE", "--checkpoint", "decline"], "nowhere: no such file"),
     "no map in it": (["densify", "DATA", "--map", "DATA", "--checkpoint", "decline"], "no map in it"),
-    "share": (["densify", "DATA", "--map", "SLAM", "--withhold", "1.5", "--checkpoint", "decline"], "withhold: 1.5"),
+    "folds": (["densify", "DATA", "--map", "SLAM", "--judge.folds", "1", "--checkpoint", "decline"], "judge.folds: 1"),
     "format": (["densify", "DATA", "--map", "SLAM", "--formats", "[obj]", "--checkpoint", "decline"], "expected ply"),
     "scale": (
         ["densify", "DATA", "--map", "SLAM", "--mm_per_unit", "-1", "--checkpoint", "decline"],
@@ -304,12 +309,12 @@ def test_bad_input_is_3_in_one_line_and_leaves_nothing(case, frames, data, tmp_p
 def test_an_existing_output_is_refused_unless_told_and_never_when_it_is_not_ours(run, data, tmp_path, capsys):
     shutil.copytree(run, tmp_path / "out")
     before = (tmp_path / "out" / "run.json").read_bytes()
-    argv = ["densify", data, "--map", data / "slam", "--checkpoint", "decline", "--withhold", 0]
+    argv = ["densify", data, "--map", data / "slam", "--checkpoint", "decline", "--judge.on", "false"]
     assert lightdepth(*argv, "-o", tmp_path / "out") == 3
     assert "already there and not empty; choose another -o, or give --overwrite" in capsys.readouterr().err
     assert (tmp_path / "out" / "run.json").read_bytes() == before
     assert lightdepth(*argv, "-o", tmp_path / "out", "--overwrite") == 0
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["arguments"]["withhold"] == 0
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["arguments"]["judge"]["on"] is False
 
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
@@ -344,7 +349,7 @@ def test_frames_without_a_map_are_mapped_and_made_dense(tmp_path, capfd):
     assert {"sparse", "map_000", "report.html"} <= set(left_in(tmp_path / "out"))
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert record["maps"][0]["aligned"] >= 6 and record["unregistered"] == {}
-    assert record["maps"][0]["withheld"]["median"] < 0.2
+    assert record["maps"][0]["judge"]["hidden"]["median"] < 0.2
     assert lightdepth("evaluate", tmp_path / "out", "--truth", tmp_path / "seq") == 0
 
 
@@ -378,7 +383,7 @@ def test_a_broken_frame_among_good_ones_is_4_and_the_rest_is_written(frames, dat
     assert len(list((tmp_path / "p").glob("*.npz"))) == 7 and not (tmp_path / "p" / "000003.npz").exists()
     (failure,) = json.loads((tmp_path / "p" / "run.json").read_text())["failures"]
     assert failure["what"] == "000003" and "not a readable image" in failure["reason"]
-    argv = ["--map", data / "slam", "--checkpoint", "decline", "--withhold", 0]
+    argv = ["--map", data / "slam", "--checkpoint", "decline", "--judge.on", "false"]
     assert lightdepth("densify", tmp_path / "seq", *argv, "-o", tmp_path / "d") == 4
     assert "map_000, keyframe 000003.png: " in capsys.readouterr().err
     text = "".join((tmp_path / "d" / m / "keyframes.csv").read_text() for m in ("map_000", "map_001"))
@@ -405,7 +410,7 @@ def test_a_map_that_no_keyframe_fits_is_4_and_the_other_is_written(frames, data,
         words = line.split()
         kept.append(" ".join([words[0], *map(str, rng.normal(size=3)), *words[4:]]))
     points.write_text("\n".join(kept) + "\n")
-    argv = ["--map", tmp_path / "slam", "--checkpoint", "decline", "--withhold", 0]
+    argv = ["--map", tmp_path / "slam", "--checkpoint", "decline", "--judge.on", "false"]
     assert lightdepth("densify", frames, *argv, "-o", tmp_path / "out") == 4
     assert "1 part(s) failed, the first: map_001: " in capsys.readouterr().err
     assert "map_000" in left_in(tmp_path / "out") and "map_001" not in left_in(tmp_path / "out")
@@ -451,7 +456,7 @@ def test_the_map_s_camera_serves_a_folder_without_one_at_any_size(frames, data, 
     for image in (tmp_path / "seq" / "frames").iterdir():
         pixels = cv2.imread(str(image))
         cv2.imwrite(str(image), cv2.resize(pixels, (192, 160)))
-    argv = ["--map", data / "slam", "--checkpoint", "decline", "--withhold", 0]
+    argv = ["--map", data / "slam", "--checkpoint", "decline", "--judge.on", "false"]
     assert lightdepth("densify", tmp_path / "seq", *argv, "-o", tmp_path / "out") == 0
     assert "rescaled to the frames' 192x160" in (tmp_path / "out" / "log.txt").read_text()
     assert json.loads((tmp_path / "out" / "map_000" / "camera.json").read_text())["width"] == 192

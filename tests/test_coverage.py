@@ -16,6 +16,7 @@ from densify.coverage import CoverageConfig, contribution, coverage, find_holes,
 from densify.dense_map import Contribution, DenseMap
 from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
+from densify.judging.config import JudgeConfig
 from densify.pipeline import densify
 from lightdepth.sparse_map import Keyframe, Submap
 from lightdepth.tube import lens
@@ -183,7 +184,7 @@ def test_confidence_tells_good_wall_from_bad():
 
     frames = rendered.frames[::2]
     found = slam(frames, 1, spurious=0.0)
-    dense = densify(sequence(frames), found.map, noisy, DensifyConfig(withhold=0.0))[0].dense
+    dense = densify(sequence(frames), found.map, noisy, DensifyConfig(judge=JudgeConfig(on=False)))[0].dense
     scale, rotation, translation = found.map_from_world[0]
     off = rendered.tube.distance_to_wall((dense.vertices - translation) @ rotation / scale)
     confident = dense.confidence > np.median(dense.confidence)

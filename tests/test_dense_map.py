@@ -15,6 +15,7 @@ from raising import refused
 from densify.alignment import Alignment
 from densify.config import DensifyConfig
 from densify.dense_map import GREEN, GREY, RED, DenseMap, Surface, read_dense_map, write_cloud
+from densify.judging.config import JudgeConfig
 from densify.pipeline import densify
 from lightdepth import native
 from lightdepth.calibration import read_camera
@@ -24,7 +25,9 @@ from lightdepth.files.tum import read_tum
 @pytest.fixture(scope="module")
 def dense() -> DenseMap:
     frames = colon(0).frames[:4]
-    return densify(sequence(frames), slam(frames, spurious=0.2).map, truth, DensifyConfig(withhold=0.0))[0].dense
+    return densify(sequence(frames), slam(frames, spurious=0.2).map, truth, DensifyConfig(judge=JudgeConfig(on=False)))[
+        0
+    ].dense
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,7 @@ from densify.evaluation.judge import judge_gap, judge_maps
 from densify.evaluation.judge_depth import judge_depth
 from densify.evaluation.judged_map import dense_models, read_run
 from densify.evaluation.truth import read_truth
+from densify.judging.config import JudgeConfig
 from densify.pipeline import densify
 from densify.similarity import Similarity, fit_similarity
 from lightdepth.camera import Pinhole
@@ -171,7 +172,7 @@ def run(tmp_path_factory) -> Path:
     """Two dense maps of a colon made with true depth, with a tenth of wrong points."""
     folder = tmp_path_factory.mktemp("run")
     frames = colon(0).frames
-    config = DensifyConfig(withhold=0.0)
+    config = DensifyConfig(judge=JudgeConfig(on=False))
     for result in densify(sequence(frames), slam(frames, maps=2, spurious=0.1).map, truth, config):
         result.dense.write(folder / f"map_{result.dense.submap.id:03d}")
     return folder

@@ -173,7 +173,7 @@ def test_the_verb_writes_a_light_that_can_be_read_and_a_report_with_nothing_left
 
 @pytest.mark.parametrize("fit_light", [True, False])
 def test_densify_fits_the_light_that_nobody_gave_unless_told_not_to(data, tmp_path, fit_light, capsys):
-    argv = ["densify", str(data), "--map", str(data / "slam"), "--checkpoint", "decline", "--withhold", "0"]
+    argv = ["densify", str(data), "--map", str(data / "slam"), "--checkpoint", "decline", "--judge.on", "false"]
     assert main([*argv, "--fit-light", str(fit_light).lower(), "-o", str(tmp_path / "run")]) == 0
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     said = "light fitted on the map: gamma" in capsys.readouterr().out
@@ -189,7 +189,7 @@ def test_densify_fits_the_light_that_nobody_gave_unless_told_not_to(data, tmp_pa
 def test_densify_keeps_a_light_that_somebody_gave(data, tmp_path, given):
     folder = tmp_path / "seq"
     shutil.copytree(data, folder)
-    argv = ["densify", str(folder), "--map", str(folder / "slam"), "--checkpoint", "decline", "--withhold", "0"]
+    argv = ["densify", str(folder), "--map", str(folder / "slam"), "--checkpoint", "decline", "--judge.on", "false"]
     if given == "file":
         (folder / "light.json").write_text('{"gamma": 2.0, "mu": 1.0}')
     else:

@@ -16,6 +16,7 @@ from densify.config import DensifyConfig
 from densify.contradiction import ContradictionConfig
 from densify.coverage import coverage
 from densify.fusion.volume import FusionConfig
+from densify.judging.config import JudgeConfig
 from densify.live.densifier import Densifier
 from densify.live.packed import PackedView, Packing, _read, _written
 from densify.pipeline import densify_submap
@@ -24,7 +25,9 @@ from lightdepth.models import DeclineModel
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Keyframe, Submap
 
-ALONE = DensifyConfig(withhold=0.0, agreement=AgreementConfig(on=False), contradiction=ContradictionConfig(on=False))
+ALONE = DensifyConfig(
+    judge=JudgeConfig(on=False), agreement=AgreementConfig(on=False), contradiction=ContradictionConfig(on=False)
+)
 """What needs no other keyframe: here live and batch are the same."""
 
 DECLINE = DeclineModel(details=False)

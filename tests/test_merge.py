@@ -17,6 +17,7 @@ from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
 from densify.inputs import fitted_to_frames
 from densify.joining import MergeConfig, join_maps, joined_submap, merge, moved_keyframe
+from densify.judging.config import JudgeConfig
 from densify.pipeline import SubmapResult, densify, densify_submap
 from densify.similarity import Similarity, robust_similarity, umeyama
 from lightdepth.datasets import FrameSequence, open_sequence
@@ -27,7 +28,7 @@ from lightdepth.sparse_map import Keyframe, Submap
 from lightdepth.tube.slam import SlamConfig, simulate_slam
 
 POINTS = MergeConfig(by=("points",))
-QUICK = DensifyConfig(withhold=0.0, recipe="paper")
+QUICK = DensifyConfig(judge=JudgeConfig(on=False), recipe="paper")
 
 
 def random_similarity(rng: np.random.Generator) -> Similarity:
@@ -288,7 +289,7 @@ def joined_error(
     rng = np.random.default_rng(seed)
     parts = [disturbed_part(whole, i, r, rng) for i, r in enumerate(rows)]
     model = DeclineModel(details=False)
-    maps = [densify_submap(p, frames, model, DensifyConfig(withhold=0.0)).dense for p, _ in parts]
+    maps = [densify_submap(p, frames, model, DensifyConfig(judge=JudgeConfig(on=False))).dense for p, _ in parts]
     found = meeting(maps, config, frames)
     assert len(found.groups) == 1, found.alone()
     (group,) = found.groups

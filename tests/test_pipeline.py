@@ -12,16 +12,15 @@ from colons import CAMERA, EXACT, colon, sequence, slam, truth
 from raising import refused
 from scipy.spatial import cKDTree
 
-from densify.agreement import AgreementConfig
-from densify.aligned import split_withheld
 from densify.alignment import Alignment
 from densify.config import DensifyConfig
 from densify.coverage import seen_share
 from densify.dense_map import DenseMap
 from densify.evaluation.errors import closest, true_cloud
-from densify.evaluation.withheld import Withheld
 from densify.fusion.volume import FusionConfig
 from densify.inputs import fitted_to_frames
+from densify.judging.config import JudgeConfig
+from densify.judging.withheld import Withheld
 from densify.pipeline import SubmapResult, densify, densify_submap
 from densify.similarity import fit_similarity
 from lightdepth.datasets import FrameSequence
@@ -33,9 +32,11 @@ from lightdepth.sparse_map import Keyframe, SparseMap, typical_distance
 from lightdepth.tube import lens
 
 FISHEYE = lens("fisheye", 120, 96)
+JUDGED = DensifyConfig(fusion=FusionConfig(voxels_per_distance=15.0))
+UNJUDGED = DensifyConfig(judge=JudgeConfig(on=False))
 
 
-def result_of(frames, recipe: DensifyConfig = DensifyConfig(), model=truth, **slam_changes):
+def result_of(frames, recipe: DensifyConfig = UNJUDGED, model=truth, **slam_changes):
     found = slam(frames, **slam_changes)
     return densify(sequence(frames), found.map, model, recipe)[0], found
 
@@ -50,53 +51,19 @@ def off_wall_voxels(tube, result: SubmapResult, found) -> np.ndarray:
 @pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=lambda c: c.name)
 def test_exact_depth_on_an_exact_map_gives_the_wall_to_a_tenth_of_a_voxel(camera):
     rendered = colon(0, camera=camera)
-    result, found = result_of(rendered.frames, DensifyConfig(withhold=0.0), config=EXACT)
+    result, found = result_of(rendered.frames, UNJUDGED, config=EXACT)
     assert len(result.dense.aligned) == len(rendered.frames)
     scale = found.map_from_world[0][0]
     assert [a.scale for a in result.dense.alignments] == pytest.approx([scale] * 10, rel=1e-3)
     off = off_wall_voxels(rendered.tube, result, found)
     assert len(off) > 5000 and np.median(off) < 0.1
-    assert result.seen_share > 0.9 and result.withheld is None
-
-
-def test_withheld_points_are_close_to_a_true_surface_and_far_from_a_constant_one():
-    frames = colon(1).frames
-    rigid = DensifyConfig(agreement=AgreementConfig(on=False))  # bent to this many points, any depth comes close
-    right, constant = (result_of(frames, rigid, model=m, spurious=0.0)[0].withheld for m in (truth, ConstantModel()))
-    assert right.median < 0.02 and right.miss < 0.05
-    assert constant.median > 5 * right.median
-    assert right.points > 500 and right.median_met <= right.median <= right.p90
-
-
-def test_withheld_points_take_no_part_in_the_alignment():
-    frames = colon(0).frames
-    found = slam(frames)
-    (submap,) = found.map.submaps
-    keyframe = submap.keyframes[0]
-    observed = observed_distances(keyframe, submap, truth(frames[0]))
-    config = DensifyConfig(withhold=0.25)
-    used, kept = split_withheld(observed, 0.25, [0, 0, 0])
-    assert len(kept) / len(observed) == pytest.approx(0.25, abs=0.08)
-    assert not set(used.point_ids) & set(kept.point_ids) and len(used) + len(kept) == len(observed)
-    again = split_withheld(observed, 0.25, [0, 0, 0])[1]
-    others = [split_withheld(observed, 0.25, seed)[1] for seed in ([1, 0, 0], [0, 0, 1])]
-    assert np.array_equal(again.point_ids, kept.point_ids)
-    assert not any(np.array_equal(o.point_ids, kept.point_ids) for o in others)
-    alignment = densify(sequence(frames), found.map, truth, config)[0].dense.alignments[0]
-    assert alignment.points == len(used)
-    assert not set(alignment.inlier_ids) & set(kept.point_ids)
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.0])
-def test_a_share_that_is_none_is_refused(share):
-    with refused(where="withhold", found=f"{share}", cure="expected a share"):
-        DensifyConfig(withhold=share)
+    assert result.seen_share > 0.9 and result.judgement is None
 
 
 def test_equal_inputs_give_equal_surfaces():
     frames = colon(0).frames
-    first, second = (result_of(frames)[0] for _ in range(2))
-    assert first.withheld == second.withheld
+    first, second = (result_of(frames, JUDGED)[0] for _ in range(2))
+    assert first.judgement == second.judgement
     assert [a.scale for a in first.dense.alignments] == [a.scale for a in second.dense.alignments]
     assert sorted(map(tuple, first.dense.vertices.round(6))) == sorted(map(tuple, second.dense.vertices.round(6)))
 
@@ -116,7 +83,7 @@ def test_a_keyframe_with_fewer_than_eight_points_is_skipped_and_says_so():
     (submap,) = slam(frames).map.submaps
     keyframe = submap.keyframes[3]
     few = with_keyframe(submap, 3, pixels=keyframe.pixels[:7], point_ids=keyframe.point_ids[:7])
-    result = densify_submap(few, sequence(frames), truth, DensifyConfig(withhold=0.0))
+    result = densify_submap(few, sequence(frames), truth, UNJUDGED)
     assert reasons(result) == {"000003.png": "7 observed points with a prediction; at least 8"}
     assert len(result.dense.aligned) == 9 and len(result.dense.triangles) > 1000
 
@@ -125,21 +92,21 @@ def test_a_map_whose_keyframes_all_have_too_few_points_gives_an_empty_surface_wi
     frames = colon(0).frames
     (submap,) = slam(frames).map.submaps
     keyframes = tuple(replace(k, pixels=k.pixels[:7], point_ids=k.point_ids[:7]) for k in submap.keyframes)
-    result = densify_submap(replace(submap, keyframes=keyframes), sequence(frames), truth, DensifyConfig())
+    result = densify_submap(replace(submap, keyframes=keyframes), sequence(frames), truth, JUDGED)
     assert len(reasons(result)) == 10 and all("at least 8" in r for r in reasons(result).values())
     assert result.dense.vertices.shape == (0, 3) and result.seen_share == 0
-    assert result.withheld.miss == 1 and np.isinf(result.withheld.median)
+    assert result.judgement.verdict.colour == "red"
 
 
 def test_a_keyframe_that_observed_nothing_is_skipped_and_a_map_without_observations_is_refused():
     frames = colon(0).frames
     (submap,) = slam(frames).map.submaps
     nothing = {"pixels": np.zeros((0, 2)), "point_ids": np.zeros(0, int)}
-    result = densify_submap(with_keyframe(submap, 0, **nothing), sequence(frames), truth, DensifyConfig())
+    result = densify_submap(with_keyframe(submap, 0, **nothing), sequence(frames), truth, UNJUDGED)
     assert reasons(result) == {"000000.png": "0 observed points with a prediction; at least 8"}
     blind = replace(submap, keyframes=tuple(replace(k, **nothing) for k in submap.keyframes))
     with refused(where="map 0", found="no keyframe observes any of its points"):
-        densify_submap(blind, sequence(frames), truth, DensifyConfig())
+        densify_submap(blind, sequence(frames), truth, UNJUDGED)
 
 
 def test_a_keyframe_without_a_frame_and_one_whose_frame_is_broken_are_skipped_with_the_reason():
@@ -153,7 +120,7 @@ def test_a_keyframe_without_a_frame_and_one_whose_frame_is_broken_are_skipped_wi
         return frames[i]
 
     read = FrameSequence([f.name for f in frames], load, "the folder")
-    result = densify_submap(submap, read, truth, DensifyConfig())
+    result = densify_submap(submap, read, truth, UNJUDGED)
     assert reasons(result) == {
         "000004.png": "the folder: no frame number 4; expected the frames that the map was made of",
         "000007.png": "000007.png: not a readable image; copy it again",
@@ -174,11 +141,11 @@ def test_frames_of_another_size_than_the_map_s_camera_are_skipped_with_the_cure(
         for f in frames
     ]
     (submap,) = slam(frames).map.submaps
-    result = densify_submap(submap, sequence(smaller), truth, DensifyConfig())
+    result = densify_submap(submap, sequence(smaller), truth, UNJUDGED)
     assert len(reasons(result)) == 10
     assert "the image is 48x40, the camera 96x80: ratio 0.5" in reasons(result)["000000.png"]
     fitted = fitted_to_frames(SparseMap((submap,), "map"), 48, 40)
-    assert not reasons(densify(sequence(smaller), fitted, truth, DensifyConfig())[0])
+    assert not reasons(densify(sequence(smaller), fitted, truth, UNJUDGED)[0])
 
 
 def test_a_map_made_at_half_size_is_fitted_with_camera_and_keypoints():
@@ -214,7 +181,7 @@ def test_points_behind_the_camera_are_told_and_the_other_keyframes_go_on():
     (submap,) = slam(frames).map.submaps
     about = np.diag([-1.0, 1, -1, 1])  # looks backwards
     turned = with_keyframe(submap, 3, cam_from_map=about @ submap.keyframes[3].cam_from_map)
-    result = densify_submap(turned, sequence(frames), truth, DensifyConfig(withhold=0.0))
+    result = densify_submap(turned, sequence(frames), truth, UNJUDGED)
     assert list(reasons(result)) == ["000003.png"]
     count = len(submap.keyframes[3].point_ids)
     assert reasons(result)["000003.png"].endswith(f"of {count} observations {count} behind the camera")
@@ -226,7 +193,10 @@ def test_observations_of_points_that_do_not_exist_are_told():
     (submap,) = slam(frames).map.submaps
     ids = submap.keyframes[3].point_ids
     result = densify_submap(
-        with_keyframe(submap, 3, point_ids=ids + 10**6), sequence(frames), truth, DensifyConfig(withhold=0.0)
+        with_keyframe(submap, 3, point_ids=ids + 10**6),
+        sequence(frames),
+        truth,
+        UNJUDGED,
     )
     expected = f"0 observed points with a prediction; at least 8; of {len(ids)} observations {len(ids)} of points that"
     assert reasons(result)["000003.png"].startswith(expected)
@@ -250,8 +220,8 @@ def test_a_submap_of_one_keyframe_and_a_constant_depth_give_a_surface():
     frames = colon(0).frames
     (submap,) = slam(frames).map.submaps
     one = replace(submap, keyframes=submap.keyframes[:1])
-    assert len(densify_submap(one, sequence(frames), truth, DensifyConfig()).dense.triangles) > 500
-    constant = densify_submap(submap, sequence(frames), ConstantModel(), DensifyConfig())
+    assert len(densify_submap(one, sequence(frames), truth, UNJUDGED).dense.triangles) > 500
+    constant = densify_submap(submap, sequence(frames), ConstantModel(), UNJUDGED)
     assert np.isfinite(constant.dense.vertices).all()
 
 
@@ -269,7 +239,7 @@ def test_a_submap_that_cannot_be_made_says_why_and_the_others_go_on():
 
 def test_the_paper_s_recipe_crops_and_neither_bends_nor_agrees():
     frames = colon(0, camera=FISHEYE).frames
-    paper, full = (result_of(frames, DensifyConfig(recipe=r))[0] for r in ("paper", "full"))
+    paper, full = (result_of(frames, replace(UNJUDGED, recipe=r))[0] for r in ("paper", "full"))
     assert all(a.bend is None for a in paper.dense.alignments) and "agree" not in paper.seconds
     assert all(a.bend is not None for a in full.dense.aligned)
     assert paper.seen_share < full.seen_share
@@ -279,7 +249,7 @@ def test_the_paper_s_recipe_crops_and_neither_bends_nor_agrees():
 
 def test_what_is_not_kept_between_passes_is_made_again():
     frames = colon(0).frames[:5]
-    kept, again = (result_of(frames, DensifyConfig(keep_mb=mb))[0] for mb in (1000, 0.3))
+    kept, again = (result_of(frames, replace(UNJUDGED, keep_mb=mb))[0] for mb in (1000, 0.3))
     np.testing.assert_array_equal(np.sort(kept.dense.vertices, 0), np.sort(again.dense.vertices, 0))
 
 
@@ -287,7 +257,7 @@ def test_every_submap_has_its_own_scale_and_every_keyframe_is_shown_once():
     frames = colon(0).frames
     found = slam(frames, maps=2)
     shown = []
-    results = densify(sequence(frames), found.map, truth, DensifyConfig(), lambda *view: shown.append(view))
+    results = densify(sequence(frames), found.map, truth, UNJUDGED, lambda *view: shown.append(view))
     for result in results:
         scale = found.map_from_world[result.dense.submap.id][0]
         assert np.median([a.scale for a in result.dense.aligned]) == pytest.approx(scale, rel=0.03)
@@ -301,7 +271,7 @@ def test_every_submap_has_its_own_scale_and_every_keyframe_is_shown_once():
 
 def test_the_surface_reaches_no_farther_than_the_points_allow():
     frames = colon(0).frames
-    near, far = (result_of(frames, DensifyConfig(fusion=FusionConfig(far=f)))[0] for f in (0.6, 3.0))
+    near, far = (result_of(frames, replace(UNJUDGED, fusion=FusionConfig(far=f)))[0] for f in (0.6, 3.0))
     assert np.ptp(near.dense.vertices, 0).max() < np.ptp(far.dense.vertices, 0).max()
     assert near.seen_share < far.seen_share
 
@@ -309,7 +279,7 @@ def test_the_surface_reaches_no_farther_than_the_points_allow():
 def test_a_point_whose_ray_misses_the_surface_counts_as_infinitely_far():
     """Half of the surface cut away: the median over all is then beyond any number, that of the rays that met is not."""
     frames = colon(0).frames
-    result, _ = result_of(frames, DensifyConfig(withhold=0.0), config=EXACT)
+    result, _ = result_of(frames, UNJUDGED, config=EXACT)
     dense, keyframe = result.dense, result.dense.submap.keyframes[0]
     observed = observed_distances(keyframe, dense.submap, truth(frames[0]))
     whole = Withheld.of(dense, [(keyframe, observed)])
@@ -337,7 +307,7 @@ def test_the_voxel_follows_the_map_s_unit():
     result, found = result_of(frames)
     (submap,) = found.map.submaps
     assert result.dense.voxel == pytest.approx(typical_distance(submap) / 52)
-    given, _ = result_of(frames, DensifyConfig(fusion=FusionConfig(voxel=0.25)))
+    given, _ = result_of(frames, replace(UNJUDGED, fusion=FusionConfig(voxel=0.25)))
     assert given.dense.voxel == 0.25
 
 

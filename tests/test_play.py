@@ -17,6 +17,7 @@ from verbs import by_options
 from densify.commands.live import live as live_verb
 from densify.config import DensifyConfig
 from densify.fusion.volume import FusionConfig
+from densify.judging.config import JudgeConfig
 from densify.live.densifier import STEPS, StepTime
 from densify.live.play import Played, play, time_spent, timings_picture, write_timings
 from lightdepth.datasets import FrameSequence
@@ -28,7 +29,7 @@ from lightdepth.tube.export import write_synthetic
 live = by_options(live_verb)
 
 DECLINE = DeclineModel(details=False)
-COARSE = DensifyConfig(withhold=0.0, fusion=FusionConfig(voxels_per_distance=15.0))
+COARSE = DensifyConfig(judge=JudgeConfig(on=False), fusion=FusionConfig(voxels_per_distance=15.0))
 
 
 def one(wall_ms: dict[str, float], **changes) -> Played:

@@ -16,7 +16,6 @@ from densify.config import DensifyConfig
 from densify.evaluation.records import AlignedFigures, DistanceFigures, MapFigures, SurfaceFigures
 from densify.page import Gallery, densify_page
 from densify.pipeline import densify
-from lightdepth.models import ConstantModel
 from lightdepth.reporting.figures import png
 from lightdepth.reporting.report import Report, number
 
@@ -90,41 +89,41 @@ def made():
     found = slam(frames, maps=1).map
     gallery = Gallery(found)
     results = densify(sequence(frames), found, truth, DensifyConfig(), gallery)
-    return results, densify(sequence(frames), found, ConstantModel(), DensifyConfig()), gallery
+    return results, gallery
 
 
-def test_the_report_of_a_run_shows_surfaces_scales_points_and_withheld_errors(made, tmp_path):
-    results, baselines, gallery = made
-    densify_page("Maps", results, baselines, gallery, ["a note"]).write(tmp_path / "report.html")
+def test_the_report_of_a_run_shows_surfaces_scales_points_and_agreement(made, tmp_path):
+    results, gallery = made
+    densify_page("Maps", results, gallery, ["a note"]).write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     page = check_self_contained(tmp_path / "report.html")
     assert len(page.found) == 3 + 1 + len(gallery.pictures[0]) >= 5
-    for part in ("a note", "4 of 4", "Withheld points", "constant distance", "Scale of each keyframe", "Time"):
+    for part in ("a note", "4 of 4", "Agreement", "hidden blocks", "constant, bent", "Scale of each keyframe", "Time"):
         assert part in text
     assert "Errors against the truth" not in text
 
 
 def test_the_report_names_keyframes_that_were_left_out_and_maps_that_could_not_be_judged(made, tmp_path):
-    (result,), _, gallery = made
+    (result,), gallery = made
     failed = replace(result.dense.alignments[1], reason="sigma is 50% of the median distance")
     dense = replace(result.dense, alignments=(result.dense.alignments[0], failed, *result.dense.alignments[2:]))
     distances = DistanceFigures(1.5, 0.7, 3.0)
     cloud = SurfaceFigures(9, 1.5, 0.7, 3.0, None, distances, {}, {}, {})
     first = MapFigures(0, 4, aligned=AlignedFigures(4, 0.12, None, 1.0, 1.0), clouds={"dense": cloud, "sparse": None})
     judged = [first, MapFigures(1, 2, "2 common poses")]
-    page = densify_page("Maps", [replace(result, dense=dense, withheld=None)], [], gallery, [], judged)
+    page = densify_page("Maps", [replace(result, dense=dense, judgement=None)], gallery, [], judged)
     page.write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     assert "000001.png left out: sigma is 50% of the median distance" in text and "3 of 4" in text
     assert "Map 1 could not be evaluated: 2 common poses" in text and ">1.5<" in text
-    assert "Withheld points" not in text
+    assert "hidden blocks" not in text
 
 
 def test_an_empty_surface_has_a_report_too(made, tmp_path):
-    (result,), _, gallery = made
+    (result,), gallery = made
     empty = np.zeros((0, 3))
     alignments = tuple(replace(a, reason="no") for a in result.dense.alignments)
     dense = replace(result.dense, vertices=empty, triangles=empty.astype(int), colors=empty, alignments=alignments)
-    densify_page("Maps", [replace(result, dense=dense)], [], gallery, []).write(tmp_path / "report.html")
+    densify_page("Maps", [replace(result, dense=dense)], gallery, []).write(tmp_path / "report.html")
     check_self_contained(tmp_path / "report.html")
     assert "0 of 4" in (tmp_path / "report.html").read_text()

@@ -21,6 +21,7 @@ from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import JudgedMap
 from densify.evaluation.records import SurfaceFigures
 from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
+from densify.judging.config import JudgeConfig
 from densify.pipeline import densify
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.errors import InputError
@@ -54,7 +55,7 @@ class BenchConfig:
     """Ways to make dense maps that are compared: paper, full, or both."""
     image_size: tuple[int, int] = IMAGE_SIZE["small"]
     """Width and height of the keyframes, pixels. A larger one takes longer."""
-    densify: DensifyConfig = field(default_factory=lambda: DensifyConfig(withhold=0.0))
+    densify: DensifyConfig = field(default_factory=lambda: DensifyConfig(judge=JudgeConfig(on=False)))
     """How dense maps are made, for all dense rows but for their recipe."""
 
     def __post_init__(self) -> None:

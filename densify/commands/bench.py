@@ -22,6 +22,7 @@ from densify.bench.scenes import Size, scenes
 from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, CellFigures, load_models, predicted, run_scene
 from densify.config import DensifyConfig, OfflineConfig, Recipe
+from densify.judging.config import JudgeConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
@@ -83,7 +84,7 @@ def run(
         checkpoints=checkpoints,
         recipes=recipes,
         image_size=image_size or IMAGE_SIZE[size],
-        densify=DensifyConfig(**vars(method), withhold=0.0),
+        densify=DensifyConfig(**vars(method), judge=JudgeConfig(on=False)),
     )
     models = load_models(checkpoints)
     with run_folder(output, "bench", arguments, overwrite) as folder:

@@ -30,7 +30,6 @@ def demo(
     size: tuple[int, int] = (320, 256),
     lens: Lens = "c3vd",
     spurious: float = 0.3,
-    withhold: float = 0.2,
     overwrite: bool = False,
 ) -> None:
     """The whole way on a synthetic colon: render, sparse map, densify, evaluate; ends at report.html.
@@ -44,8 +43,6 @@ def demo(
         size: Width and height of the images, pixels. A larger one shows finer detail and takes longer.
         lens: Lens of the endoscope: pinhole, telescope, fisheye or c3vd.
         spurious: Share of the map points that are wrong. A larger one makes the map harder to densify.
-        withhold: Share of each keyframe's observed points kept out of the alignment, to judge the surface by. A
-            larger one judges more surely, and aligns on fewer points.
         overwrite: Replace a run made before.
     """
     arguments = recorded(
@@ -56,7 +53,6 @@ def demo(
         size=size,
         lens=lens,
         spurious=spurious,
-        withhold=withhold,
     )
     model = load_model(checkpoint, details=False)
     with run_folder(output, "demo", arguments, overwrite) as run:
@@ -68,19 +64,19 @@ def demo(
         write_synthetic(sequence.frames, slam, run.folder / "data")
         data = open_sequence(run.folder / "data")
         sparse_map = read_map(run.folder / "data" / "slam")
-        work = Densified.make(data, sparse_map, model, DensifyConfig(withhold=withhold, seed=seed))
+        work = Densified.make(data, sparse_map, model, DensifyConfig())
         work.write(run, ("ply",), None)
         evaluation = judge_maps(dense_models(read_run(run.folder)), read_truth(data))
         run.log(write_evaluations({"demo": evaluation}, run.folder))
         run.record["evaluation"] = [found.record() for found in evaluation.judged.maps]
-        notes = [
+        notes = [f"Verdict: {work.verdict}."] if work.verdict is not None else []
+        notes += [
             f"A synthetic colon (seed {seed}), {frames} frames, a simulated SLAM export of {len(sparse_map.submaps)} "
             f"submaps with {spurious:.0%} wrong points; depth by {work.model}. Truth is exact, so errors are errors.",
         ]
         page = densify_page(
             "Demo: from frames to a dense surface",
             work.results,
-            work.baselines,
             work.gallery,
             notes,
             evaluation.judged.maps,

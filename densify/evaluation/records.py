@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from densify.evaluation.withheld import WithheldOfMap
+from densify.judging.withheld import WithheldOfMap
 from lightdepth.reporting.run import git_revision, plain, versions
 
 

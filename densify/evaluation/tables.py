@@ -31,7 +31,7 @@ from densify.evaluation.records import (
     metrics_record,
 )
 from densify.evaluation.suite import Suite, alone
-from densify.evaluation.withheld import WithheldOfMap
+from densify.judging.withheld import WithheldOfMap
 from lightdepth.reporting.report import number
 
 _METRICS = {
@@ -227,7 +227,10 @@ def withheld_table(withheld: Sequence[WithheldOfMap]) -> Table:
         for name, found in (("this depth", entry.withheld), ("constant distance", entry.constant)):
             if found is not None:
                 rows.append([where, name, found.points, found.median, found.p90, found.miss])
-    title = "Withheld points of the sparse map: |surface - point| / point along the ray, no truth needed."
+    title = (
+        "Agreement with the sparse map: |distance - point| / point along the ray, at points that were hidden from the "
+        "alignment; no truth needed, and no error either."
+    )
     return Table(title, ["Map", "Depth", "Points", "Median", "90th percentile", "Share that misses"], rows)
 
 

@@ -64,7 +64,7 @@ def merge(
     on_keyframe: OnKeyframe | None = None,
 ) -> Merged:
     """Joins the submaps of a run, and makes each group of several dense as one."""
-    rng = np.random.default_rng([recipe.seed, 2])
+    rng = np.random.default_rng([recipe.judge.seed, 2])
     by_id = {r.dense.submap.id: r.dense.submap for r in results}
     meeting = join_maps([r.dense for r in results], frames, config, rng)
     groups = [g for g in meeting.groups if len(g) > 1]

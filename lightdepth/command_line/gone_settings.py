@@ -10,7 +10,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-GONE_SETTINGS: dict[str, dict[str, str]] = {"import": {"source": "it is data now, as with the other verbs"}}
+_WITHHOLD = "the surface uses every point; blocks of wall judge it, see judge.folds"
+GONE_SETTINGS: dict[str, dict[str, str]] = {
+    "import": {"source": "it is data now, as with the other verbs"},
+    "densify": {"withhold": _WITHHOLD, "seed": "it drew withheld points; judge.seed draws blocks of wall"},
+    "demo": {"withhold": _WITHHOLD},
+}
 """By verb, the dotted keys that are gone, each with what became of it. A key stands for all that is below it."""
 
 

@@ -10,7 +10,7 @@ inliers. LIGHTDEPTH_ABLATION=docs/densify-ablation.md writes the tables there; L
 
     accuracy      distance of each vertex to the closest true point, by the simulation's own Sim(3): RMS and median, mm
     truth         distance of each true point in the keyframes' view to the surface, at most 10 mm, mean
-    withheld      median error of withheld points along their rays, relative; nearly a third of them are wrong points
+    hidden        median error at points of blocks that were hidden, relative; nearly a third of them are wrong points
 """
 
 import os
@@ -49,7 +49,7 @@ DROPPED = {
     "contradicted pixels kept": replace(FULL, contradiction=ContradictionConfig(on=False)),
     "grazing pixels and edges kept": replace(FULL, rectify=RectifyConfig(max_slope=np.inf)),
 }
-MEASURES = {"median": "median mm", "rms": "RMS mm", "truth": "truth to surface mm", "withheld": "withheld %"}
+MEASURES = {"median": "median mm", "rms": "RMS mm", "truth": "truth to surface mm", "hidden": "hidden blocks %"}
 
 
 @dataclass(frozen=True)
@@ -89,12 +89,12 @@ class Scene:
         off = self.tree.query(vertices)[0]
         keyframes = {k.number for k in result.dense.submap.keyframes}
         seen = true_cloud([f for f in self.frames if f.number in keyframes], stride=6)
-        assert result.withheld is not None
+        assert result.judgement is not None and result.judgement.hidden is not None
         return {
             "median": float(np.median(off)),
             "rms": float(np.sqrt((off**2).mean())),
             "truth": float(np.minimum(_to_surface(seen, vertices, result.dense.triangles), 10).mean()),
-            "withheld": 100 * result.withheld.median,
+            "hidden": 100 * result.judgement.hidden.median,
         }
 
 

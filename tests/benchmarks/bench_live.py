@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.config import LIVE_FUSION, DensifyConfig
 from densify.fusion.volume import FusionConfig
+from densify.judging.config import JudgeConfig
 from densify.live.densifier import STEPS, Densifier
 from densify.live.play import play, time_spent
 from lightdepth.camera import CameraModel
@@ -32,7 +33,7 @@ from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 from lightdepth.tube import lens, render_sequence
 from lightdepth.tube.slam import SlamConfig, simulate_slam
 
-LIVE = DensifyConfig(fusion=LIVE_FUSION, withhold=0.0)
+LIVE = DensifyConfig(fusion=LIVE_FUSION, judge=JudgeConfig(on=False))
 COARSE = replace(LIVE, fusion=FusionConfig(voxels_per_distance=26.0))
 """For the long ones, which compare times and do not state them: a quarter of the work."""
 

@@ -34,9 +34,22 @@ class Withheld:
     median_met: float | None = None
     """median share of the points whose rays meet the surface; None where a run folder does not say it"""
 
+    def record(self) -> dict[str, float]:
+        """For files: what is known of it."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+    @classmethod
+    def of_errors(cls, shares: np.ndarray) -> Withheld | None:
+        """Of shares (n,) at single keyframes, where no ray can miss; those that are NaN were not judged."""
+        known = shares[np.isfinite(shares)]
+        if not len(known):
+            return None
+        median, p90 = (float(np.quantile(known, q, method="higher")) for q in (0.5, 0.9))
+        return cls(len(known), median, p90, 0.0, median)
+
     @classmethod
     def of(cls, dense: DenseMap, withheld: Sequence[tuple[Keyframe, ObservedDistances]]) -> Withheld | None:
-        """Of a surface and the points withheld of each keyframe; None when no point was withheld."""
+        """Of a surface and distances of each keyframe that it was not made from; None when there are none."""
         errors = []
         for keyframe, observed in withheld:
             if len(observed):
@@ -66,12 +79,9 @@ class WithheldOfMap:
 
     def record(self) -> dict[str, object]:
         """As metrics.json has it."""
-        both = {"withheld": _told(self.withheld), "withheld_constant": self.constant and _told(self.constant)}
+        constant = self.constant and self.constant.record()
+        both = {"withheld": self.withheld.record(), "withheld_constant": constant}
         return {"map": self.map_id, **both, **({"sequence": self.sequence} if self.sequence else {})}
-
-
-def _told(withheld: Withheld) -> dict[str, float]:
-    return {name: value for name, value in asdict(withheld).items() if value is not None}
 
 
 class _Withheld(BaseModel):
@@ -93,6 +103,27 @@ class _Map(BaseModel):
     withheld_constant: _Withheld | None = None
 
 
+class _Blocks(BaseModel):
+    count: int
+    constant_bent: float | None
+
+
+class _Judge(BaseModel):
+    hidden: _Withheld | None
+    blocks: _Blocks
+
+    def read(self) -> tuple[Withheld, Withheld]:
+        """What hidden blocks say of the keyframes as they were delivered, and of a constant distance, bent."""
+        bent = np.inf if self.blocks.constant_bent is None else self.blocks.constant_bent
+        constant = Withheld(self.blocks.count, bent, np.inf, 0.0, bent)
+        return self.hidden.read() if self.hidden else Withheld(0, np.inf, np.inf, 0.0), constant
+
+
+class _Judged(BaseModel):
+    map: int
+    judge: _Judge
+
+
 def withheld_errors(folder: Path) -> list[WithheldOfMap]:
     """What a densify run says of the points that it withheld: the judge where there is no truth. Empty where nothing
     was withheld. Raises InputError where run.json does not say it as `densify` does."""
@@ -101,7 +132,10 @@ def withheld_errors(folder: Path) -> list[WithheldOfMap]:
         return []
     found = []
     for told in read_json(file).get("maps", []):
-        if isinstance(told, dict) and told.get("withheld"):
+        if isinstance(told, dict) and told.get("judge"):
+            judged = checked_fields(_Judged, told, f"{file}: maps")
+            found.append(WithheldOfMap(judged.map, *judged.judge.read()))
+        elif isinstance(told, dict) and told.get("withheld"):
             entry = checked_fields(_Map, told, f"{file}: maps")
             constant = None if entry.withheld_constant is None else entry.withheld_constant.read()
             found.append(WithheldOfMap(entry.map, entry.withheld.read(), constant))

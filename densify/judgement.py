@@ -1,0 +1,121 @@
+"""The judge of a submap: it hides blocks of wall, asks the images, undoes bends that make things worse, and speaks.
+
+It goes along with the pipeline: it sees every keyframe as it is predicted, judges the bends once they are all aligned,
+and the surface once it is there. The surface rests on every point of the map; what is hidden is hidden from alignments
+that are made for the judge alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from densify.agreement import unbent
+from densify.aligned import AlignedKeyframe
+from densify.bending import Bend
+from densify.config import DensifyConfig
+from densify.dense_map import DenseMap
+from densify.judging.brake import Tried, undone
+from densify.judging.columns import Columns, FourWays, Method, hidden_errors
+from densify.judging.images import Images, Seen
+from densify.judging.verdict import Judgement
+from densify.judging.withheld import Withheld
+from densify.predictions import SeenKeyframe
+from lightdepth.blocks import submap_folds
+from lightdepth.sparse_map import Keyframe, Submap
+
+
+class Judge:
+    """The judge of one submap; switched off, it keeps and undoes nothing. Raises InputError where no keyframe observes
+    a point."""
+
+    def __init__(self, submap: Submap, config: DensifyConfig) -> None:
+        self._submap, self._config = submap, config
+        self._method = Method(config.alignment, config.agreement, config.bending)
+        self._images = Images(config.judge.parallax)
+        self._fold = submap_folds(submap, config.judge.folds, config.judge.seed)
+        self._blocks: dict[str, np.ndarray] = {}
+        self._told: dict[str, Seen] = {}
+        self._undone: dict[str, str] = {}
+
+    def see(self, keyframe: Keyframe, seen: SeenKeyframe) -> None:
+        """Keeps what the images of a keyframe will be asked for."""
+        if self._config.judge.on and seen.frame is not None and seen.prediction is not None:
+            self._images.see(keyframe, seen.frame, seen.prediction)
+
+    def braked(self, keyframes: Sequence[AlignedKeyframe]) -> list[AlignedKeyframe]:
+        """The same keyframes, those whose bend makes things worse at one scale, with the reason."""
+        self._ask(keyframes)
+        bent = {k.keyframe.name: self._tried(k) for k in keyframes if k.alone is not None and k.alignment.bend}
+        self._undone = undone(bent) if self._config.judge.on else {}
+        return [self._at_one_scale(k) if k.keyframe.name in self._undone else k for k in keyframes]
+
+    def _ask(self, keyframes: Sequence[AlignedKeyframe]) -> None:
+        """Hides blocks of wall, and measures between the images; once."""
+        if self._blocks or not self._config.judge.on:
+            return
+        self._told = self._images.measure(
+            self._submap, {k.keyframe.name: (k.alone or k.alignment).scale for k in keyframes if k.alignment.ok}
+        )
+        for k in keyframes:
+            if k.view is not None and len(k.view.observed):
+                fold = self._fold[self._submap.rows_of(k.view.observed.point_ids)[0]]
+                self._blocks[k.keyframe.name] = hidden_errors(k.view, fold, self._method)
+
+    def judgement(self, dense: DenseMap, keyframes: Sequence[AlignedKeyframe]) -> Judgement | None:
+        """What is known of the surface; None where the judge is switched off."""
+        if not self._config.judge.on:
+            return None
+        self._ask(keyframes)
+        rng = np.random.default_rng([self._config.judge.seed, self._submap.id])
+        drawn, images, delivered = [], [], []
+        for k in keyframes:
+            if k.view is None or not len(k.view.observed):
+                continue
+            fold = -rng.integers(0, self._config.judge.folds, len(k.view.observed))
+            drawn.append(hidden_errors(k.view, fold, self._method))
+            if k.keyframe.name in self._blocks:
+                delivered.append(self._blocks[k.keyframe.name][:, 1 if k.alignment.bend else 0])
+            told = self._told.get(k.keyframe.name)
+            if told is not None and len(told.judging) and len(k.view.observed) >= self._config.alignment.min_points:
+                images.append(FourWays.of(k.view, self._method).errors(told.judging))
+        points = [(k.keyframe, self._told[k.keyframe.name].judging) for k in keyframes if k.keyframe.name in self._told]
+        sizes = [_size(k.alignment.bend) for k in keyframes if k.alignment.bend]
+        return Judgement(
+            Columns.of(list(self._blocks.values())),
+            Columns.of(drawn),
+            Columns.of(images),
+            Withheld.of_errors(np.concatenate([np.zeros(0), *delivered])),
+            Withheld.of(dense, points),
+            len(keyframes),
+            sum(k.alignment.ok for k in keyframes),
+            len(self._undone),
+            float(np.median(sizes)) if sizes else 0.0,
+        )
+
+    def _tried(self, k: AlignedKeyframe) -> Tried:
+        bend, alone, told = k.alignment.bend, k.alone, self._told.get(k.keyframe.name)
+        assert bend is not None and alone is not None
+        by_images = np.zeros((0, 2))
+        if told is not None and len(told.deciding):
+            o = told.deciding
+            guesses = o.predicted * np.exp(bend.at(o.pixels, o.predicted)), o.predicted * alone.scale
+            by_images = np.abs(np.stack(guesses, 1) / o.mapped[:, None] - 1)
+        blocks = self._blocks.get(k.keyframe.name, np.zeros((0, 4)))
+        return Tried(by_images, blocks[:, [1, 0]], _size(bend))
+
+    def _at_one_scale(self, k: AlignedKeyframe) -> AlignedKeyframe:
+        assert k.alone is not None and k.view is not None
+        alignment = replace(k.alone, unbent_because=self._undone[k.keyframe.name])
+        level = unbent(replace(k.view, scale=k.alone.scale), self._config.bending)
+        return replace(k, alignment=alignment, bend=level)
+
+
+def _size(bend: Bend) -> float:
+    """The larger of slope and bumps (root mean square), in deviations of their prior."""
+    own = bend.weights[1:] * np.sqrt(bend.config.precision[1:])
+    slopes = 1 if bend.config.on and bend.config.slope_deviation else 0
+    bumps = float(np.sqrt((own[slopes:] ** 2).mean())) if len(own) > slopes else 0.0
+    return max(float(np.abs(own[:slopes]).max(initial=0.0)), bumps)

@@ -1,0 +1,28 @@
+"""How a dense map is judged where there is no truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from lightdepth.errors import InputError
+from lightdepth.parallax import ParallaxConfig
+
+
+@dataclass(frozen=True)
+class JudgeConfig:
+    """How a dense map is judged where there is no truth. The surface itself uses every point."""
+
+    on: bool = True
+    """Whether the result is judged, and a bend that makes it worse is undone; switched off, every bend is kept and
+    there is no verdict."""
+    folds: int = 5
+    """Number of parts that the wall is divided into, in blocks; the keyframes are aligned without each in turn. More
+    hide less at a time and take longer."""
+    seed: int = 0
+    """Number that draws the blocks of wall. Another one hides other blocks together."""
+    parallax: ParallaxConfig = field(default_factory=ParallaxConfig)
+    """how distances are measured between the images of keyframes (--judge.parallax.on false leaves them out)"""
+
+    def __post_init__(self) -> None:
+        if self.folds < 2:
+            raise InputError("judge.folds", f"{self.folds}", "expected at least 2 parts, such as 5")

@@ -1,0 +1,145 @@
+"""One colour and one sentence: whether a surface can be trusted, as far as anything but truth can tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from densify.judging.columns import Columns
+from densify.judging.withheld import Withheld
+
+Colour = Literal["green", "amber", "red"]
+
+GREEN, RED = 0.055, 0.11
+"""Disagreement, as a share of the distance, up to which a surface is green and from which it is red."""
+_MISSES = 0.4
+_LEAST = 60
+_LEAST_SHARE = 0.04
+_NO_MERIT = 0.95
+_AGAINST = 1.15
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What is known of a submap's surface without truth."""
+
+    blocks: Columns
+    """agreement with the map: points of blocks of wall that were hidden from the alignment in turn"""
+    drawn: Columns
+    """the same with points drawn one by one, which lie beside points that were used: the flattering number"""
+    images: Columns
+    """agreement with the images: distances by parallax, which nothing was fitted to"""
+    hidden: Withheld | None = None
+    """the points of `blocks` by what each keyframe was delivered with, its bend or one scale"""
+    surface: Withheld | None = None
+    """the delivered surface against distances by parallax; None where the images are silent"""
+    keyframes: int = 0
+    aligned: int = 0
+    undone: int = 0
+    """keyframes whose bend was undone"""
+    bends: float = 0.0
+    """median size of the bends in deviations of their prior; 1 is usual"""
+
+    @property
+    def number(self) -> float:
+        """The program's own estimate of the surface's error, as a share of the distance: what the images say, or the
+        map where they are silent. Not an error: that takes truth."""
+        if self.surface is not None and self.surface.points >= _LEAST:
+            met = self.surface.median_met
+            return float("inf") if met is None else met
+        return self.hidden.median if self.hidden is not None else float("inf")
+
+    @property
+    def verdict(self) -> Verdict:
+        return _verdict(self)
+
+    @property
+    def summary(self) -> str:
+        """Both agreements in a few words, with the constant distance's under the same help."""
+        told = [f"agreement with the map {self._beside(self.blocks)}"]
+        if self.images.count:
+            told.append(f"with the images {self._beside(self.images)}")
+        return ", ".join(told)
+
+    @staticmethod
+    def _beside(columns: Columns) -> str:
+        return f"{_share(columns.best)} (a constant distance {_share(columns.constant)})"
+
+    def record(self) -> dict[str, object]:
+        """For run.json."""
+        told = None if self.surface is None else self.surface.record()
+        return {
+            "blocks": self.blocks.record(),
+            "drawn": self.drawn.record(),
+            "images": self.images.record(),
+            "hidden": None if self.hidden is None else self.hidden.record(),
+            "surface": told,
+            "number": self.number if np.isfinite(self.number) else None,
+            "bends_undone": self.undone,
+            "bend_size": self.bends,
+        }
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A colour, and the sentence that gives its reasons with figures."""
+
+    colour: Colour
+    sentence: str
+
+    def __str__(self) -> str:
+        return f"{self.colour}: {self.sentence}"
+
+
+def worst(verdicts: Sequence[Verdict]) -> Verdict | None:
+    """The verdict on a run: the worst of its submaps'."""
+    order = ("green", "amber", "red")
+    return max(verdicts, key=lambda v: order.index(v.colour), default=None)
+
+
+def _verdict(j: Judgement) -> Verdict:
+    spoke = j.surface.points if j.surface is not None else 0
+    number = j.number
+    if not j.aligned:
+        return Verdict("red", "no keyframe could be aligned")
+    red, amber = [], []
+    if spoke >= _LEAST and j.surface is not None:
+        said = f"the images' parallax puts the wall {_share(number)} from the surface in the median ({spoke} pixels)"
+        if number > RED:
+            red.append(said)
+        elif number > GREEN:
+            amber.append(said)
+        if j.surface.miss > _MISSES:
+            amber.append(f"{j.surface.miss:.0%} of what they see is not on the surface")
+    else:
+        said = "the images have too little texture or parallax to judge by"
+        amber.append(f"{said}; hidden blocks of the map's wall are {_share(number)} off")
+        if not number <= RED:
+            red.append(f"hidden blocks of the map's wall are {_share(number)} off, and the images say nothing")
+    if 2 * j.aligned < j.keyframes:
+        red.append(f"only {j.aligned} of {j.keyframes} keyframes could be aligned")
+    if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
+        amber.append(
+            f"the map's points bend the depth against the images ({_share(j.images.bent)} off, one scale "
+            f"{_share(j.images.one_scale)}): they may err together, and {j.undone} keyframes keep one scale"
+        )
+    light = j.images if j.images.count >= _LEAST else j.blocks
+    remarks = []
+    if not light.best < _NO_MERIT * light.constant:
+        remarks.append(
+            "the light adds nothing here: a constant distance does as well "
+            f"({_share(light.constant)} against {_share(light.best)})"
+        )
+    if red:
+        return Verdict("red", "; ".join(red + amber + remarks))
+    if amber:
+        return Verdict("amber", "; ".join(amber + remarks))
+    remarks.append(f"{j.aligned} of {j.keyframes} keyframes aligned")
+    return Verdict("green", "; ".join([said, *remarks]))
+
+
+def _share(value: float) -> str:
+    return f"{value:.1%}" if np.isfinite(value) else "infinitely far"

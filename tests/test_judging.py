@@ -1,0 +1,185 @@
+"""What is known of a surface without truth, on colons where the truth is known to the tests alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from densify.config import DensifyConfig
+from densify.fusion.volume import FusionConfig
+from densify.judging.brake import Tried, undone
+from densify.judging.columns import Columns
+from densify.judging.config import JudgeConfig
+from densify.judging.verdict import Judgement, Verdict, worst
+from densify.judging.withheld import Withheld
+from densify.pipeline import densify_submap
+from lightdepth.camera import Pinhole
+from lightdepth.parallax import ParallaxConfig
+from lightdepth.prediction import DepthPrediction
+from lightdepth.sparse_map import Submap
+from tests.colons import colon, sequence, slam, truth
+from tests.raising import refused
+
+COARSE = DensifyConfig(fusion=FusionConfig(voxels_per_distance=15.0))
+CAMERA = Pinhole(160, 128, 86.0, 86.0, 80.0, 64.0)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return colon(0, 6, 10.0, CAMERA).frames
+
+
+@pytest.fixture(scope="module")
+def submap(frames) -> Submap:
+    return slam(frames, spurious=0.05, points_per_keyframe=120).map.submaps[0]
+
+
+def side_moved(submap: Submap, factor: float, share: float = 0.45) -> Submap:
+    """The points of one side of the wall farther from the cameras by a factor."""
+    middle = np.mean([k.center for k in submap.keyframes], axis=0)
+    off = submap.points - middle
+    side = off @ submap.keyframes[0].cam_from_map[0, :3] / np.linalg.norm(off, axis=1)
+    moved = side > np.quantile(side, 1 - share)
+    return replace(submap, points=np.where(moved[:, None], middle + factor * off, submap.points))
+
+
+def judged(submap, frames, model=truth, config=COARSE):
+    result = densify_submap(submap, sequence(frames), model, config)
+    assert result.judgement is not None
+    return result.judgement, result
+
+
+def test_true_depth_on_a_good_map_is_green_and_a_constant_distance_is_far_behind(submap, frames):
+    judgement, _ = judged(submap, frames)
+    assert judgement.verdict.colour == "green", judgement.verdict
+    assert judgement.images.count > 100 and judgement.images.one_scale < 0.03
+    assert judgement.blocks.one_scale < 0.03
+    assert judgement.images.constant_one_scale > 5 * judgement.images.one_scale
+
+
+def test_the_images_see_that_a_side_of_the_wall_was_moved_and_the_bend_is_undone(submap, frames):
+    """True depth, which needs no bend: bent to the moved points, it is wrong by half of their factor."""
+    moved = side_moved(submap, 1.3)
+    unjudged = densify_submap(moved, sequence(frames), truth, replace(COARSE, judge=JudgeConfig(on=False)))
+    assert all(a.bend is not None for a in unjudged.dense.alignments if a.ok)
+    judgement, result = judged(moved, frames)
+    aligned = [a for a in result.dense.alignments if a.ok]
+    assert judgement.undone > 0.7 * len(aligned)
+    assert all("the images" in a.unbent_because for a in aligned if a.bend is None)
+    assert judgement.verdict.colour != "green"
+
+
+def test_where_the_map_is_right_the_bends_stay(submap, frames):
+    """Depth that is wrong by a smooth field: the bend mends it, and the images agree."""
+
+    def leaning(frame) -> DepthPrediction:
+        right = truth(frame)
+        across = np.linspace(-0.3, 0.3, right.distance.shape[1], dtype=np.float32)
+        return replace(right, distance=right.distance * np.exp(across))
+
+    judgement, _ = judged(submap, frames, leaning)
+    assert judgement.undone == 0 and judgement.images.bent < 0.5 * judgement.images.one_scale
+    assert judgement.verdict.colour == "green", judgement.verdict
+
+
+def test_the_constant_gets_the_same_help_and_the_verdict_says_when_the_light_adds_nothing(submap, frames):
+    def constant(frame) -> DepthPrediction:
+        right = truth(frame)
+        return replace(right, distance=np.ones_like(right.distance))
+
+    judgement, _ = judged(submap, frames, constant)
+    assert judgement.images.best == pytest.approx(judgement.images.constant, rel=0.05)
+    assert "a constant distance does as well" in judgement.verdict.sentence
+
+
+def test_white_frames_are_never_green(submap, frames):
+    white = [replace(f, image=np.ones_like(f.image)) for f in frames]
+    judgement, _ = judged(submap, white, truth)
+    assert judgement.images.count == 0 and judgement.surface is None
+    assert judgement.verdict.colour != "green" and "too little texture" in judgement.verdict.sentence
+
+
+def test_the_surface_uses_every_point(submap, frames):
+    _, result = judged(submap, frames)
+    for keyframe, alignment in zip(submap.keyframes, result.dense.alignments, strict=True):
+        assert alignment.points == pytest.approx(len(submap.observed_points(keyframe)[0]), rel=0.05)
+
+
+def test_points_drawn_one_by_one_flatter_where_the_map_errs_together(submap, frames):
+    judgement, _ = judged(side_moved(submap, 1.3, 0.3), frames)
+    assert judgement.drawn.bent < judgement.blocks.bent
+
+
+def test_the_judge_can_be_switched_off_and_the_images_left_out(submap, frames):
+    off = densify_submap(submap, sequence(frames), truth, replace(COARSE, judge=JudgeConfig(on=False)))
+    assert (off.judgement is None and "judge" not in off.seconds) or off.seconds["judge"] < 1
+    silent = JudgeConfig(parallax=ParallaxConfig(on=False))
+    judgement, _ = judged(submap, frames, config=replace(COARSE, judge=silent))
+    assert judgement.images.count == 0 and judgement.blocks.count > 100
+    assert judgement.number == judgement.hidden.median
+
+
+def test_fewer_than_two_folds_are_refused():
+    with refused(where="judge.folds", found="1", cure="at least 2"):
+        JudgeConfig(folds=1)
+
+
+def some(count: int, bent: float, scaled: float) -> np.ndarray:
+    return np.tile([bent, scaled], (count, 1)).astype(float)
+
+
+NONE = np.zeros((0, 2))
+
+
+def test_a_bend_that_the_images_speak_against_is_undone_and_others_stay():
+    tried = {"bad": Tried(some(80, 0.2, 0.05), NONE, 0.5), "good": Tried(some(80, 0.03, 0.1), NONE, 0.5)}
+    found = undone(tried)
+    assert set(found) == {"bad"} and "by the images" in found["bad"]
+
+
+def test_where_the_images_are_silent_hidden_blocks_decide_and_a_bend_beyond_its_prior_goes():
+    tried = {
+        "better": Tried(NONE, some(90, 0.03, 0.1), 0.8),
+        "worse": Tried(NONE, some(90, 0.2, 0.1), 0.8),
+        "large": Tried(NONE, some(90, 0.03, 0.1), 2.6),
+    }
+    found = undone(tried)
+    assert set(found) == {"worse", "large"}
+    assert "hidden blocks" in found["worse"] and "2.6 times" in found["large"]
+
+
+def test_a_bend_that_nothing_can_judge_is_undone():
+    assert set(undone({"a": Tried(NONE, NONE, 0.1)})) == {"a"}
+    assert undone({}) == {}
+
+
+def known(**changes) -> Judgement:
+    good = Columns(500, 0.03, 0.02, 0.2, 0.1)
+    made = Judgement(good, good, good, None, Withheld(500, 0.02, 0.1, 0.0, 0.02), 10, 10)
+    return replace(made, **changes)
+
+
+@pytest.mark.parametrize(
+    ("colour", "sentence", "changes"),
+    [
+        ("green", "2.0%", {}),
+        ("amber", "8.0%", {"surface": Withheld(500, 0.08, 0.2, 0.0, 0.08)}),
+        ("red", "15.0%", {"surface": Withheld(500, 0.15, 0.3, 0.0, 0.15)}),
+        ("red", "only 4 of 10 keyframes", {"aligned": 4}),
+        ("red", "no keyframe", {"aligned": 0}),
+        ("green", "2.0% against 2.0%", {"images": Columns(500, 0.03, 0.02, 0.2, 0.02)}),
+        ("amber", "against the images (8.0% off", {"images": Columns(500, 0.03, 0.08, 0.2, 0.1), "undone": 6}),
+        ("amber", "50% of what they see is not", {"surface": Withheld(500, np.inf, np.inf, 0.5, 0.02)}),
+        ("red", "infinitely far", {"surface": None, "hidden": None}),
+    ],
+)
+def test_the_verdict_has_a_colour_and_a_reason_with_figures(colour, sentence, changes):
+    verdict = known(**changes).verdict
+    assert verdict.colour == colour and sentence in verdict.sentence, verdict
+
+
+def test_the_verdict_on_a_run_is_that_of_its_worst_map():
+    green, red = Verdict("green", "a"), Verdict("red", "b")
+    assert worst([green, red, green]) is red and worst([]) is None
