@@ -11,6 +11,7 @@ from lightdepth.camera import Pinhole
 from lightdepth.datasets import FrameSequence
 from lightdepth.frame import Frame
 from lightdepth.prediction import DepthPrediction
+from lightdepth.sparse_map import Submap
 from lightdepth.tube import ShapeConfig, TextureConfig, TubeConfig, TubeSequence, render_sequence
 from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
 
@@ -28,6 +29,13 @@ def colon(seed: int = 0, count: int = 10, travel: float = 12.0, camera=CAMERA) -
 def slam(frames, seed: int = 0, config: SlamConfig = SlamConfig(), **changes) -> SimulatedSlam:
     """A simulated SLAM of every frame, in one map, with `changes` to its configuration."""
     return simulate_slam(frames, replace(config, **{"keyframe_every": 1, "maps": 1, **changes}), seed)
+
+
+def in_world(found: SimulatedSlam, submap: Submap) -> np.ndarray:
+    """Points (n, 3) of a submap in the colon's own frame, mm."""
+    scale, rotation, translation = found.map_from_world[submap.id]
+    result: np.ndarray = (submap.points - translation) @ rotation / scale
+    return result
 
 
 def sequence(frames: list[Frame], source: str = "frames in memory") -> FrameSequence:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from colons import CAMERA, EXACT, SMALL, colon, slam
+from colons import CAMERA, EXACT, SMALL, colon, in_world, slam
 from raising import refused
 
 from lightdepth.camera import KannalaBrandt, Pinhole, Scaramuzza
@@ -191,11 +191,6 @@ def test_the_share_of_wrong_points_is_as_asked():
         assert len(submap.points) > 300
         assert len(wrong) / len(submap.points) == pytest.approx(share, abs=0.07)
         assert set(wrong) <= set(submap.point_ids)
-
-
-def in_world(found, submap) -> np.ndarray:
-    scale, rotation, translation = found.map_from_world[submap.id]
-    return (submap.points - translation) @ rotation / scale
 
 
 def test_wrong_points_are_off_the_wall_and_right_ones_on_it():
