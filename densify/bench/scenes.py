@@ -85,7 +85,7 @@ class Rendered:
     def slam(self, wrong_share: float) -> SimulatedSlam:
         """The SLAM's export with a share of wrong points."""
         new = round(_POINTS / min(self.scene.keyframes, 20))
-        config = SlamConfig(1, self.scene.maps, points_per_keyframe=new, spurious=wrong_share)
+        config = SlamConfig("independent", 1, self.scene.maps, points_per_keyframe=new, spurious=wrong_share)
         return simulate_slam(list(self.frames), config, self.scene.seed)
 
 

@@ -15,6 +15,7 @@ from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import Lens, render_sequence
 from lightdepth.tube import lens as tube_lens
 from lightdepth.tube.export import write_synthetic
+from lightdepth.tube.map_errors import MapErrors, moved_ids, with_errors
 from lightdepth.tube.scene import TubeConfig, realistic
 from lightdepth.tube.sequence import TubeSequence
 from lightdepth.tube.slam import SlamConfig, simulate_slam
@@ -26,14 +27,14 @@ class ColonConfig:
 
     lens: Lens = "c3vd"
     """Lens of the endoscope: pinhole, telescope, fisheye or c3vd."""
-    frames: int = 40
+    frames: int = 120
     """Number of frames to render, spread evenly over --travel_mm. More lie closer together on the same path, and take
     longer."""
     size: tuple[int, int] = (320, 256)
     """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
     seed: int = 0
     """Number that draws the colon, its light and the path. Another one draws another colon."""
-    travel_mm: float = 30.0
+    travel_mm: float = 36.0
     """Length of the path along the colon, mm. A longer one makes neighbouring frames less alike."""
     light: str | None = None
     """Light to have instead of a drawn one: light.json, or gamma=2.2,mu=0."""
@@ -69,6 +70,7 @@ def synth(
     spurious: float | None = None,
     scene: TubeConfig = TubeConfig(),
     slam: SlamConfig = SlamConfig(),
+    errors: MapErrors = MapErrors(),
     overwrite: bool = False,
 ) -> None:
     """A synthetic colon sequence with exact truth, and a multi-map SLAM export with known wrong points.
@@ -81,11 +83,12 @@ def synth(
             to densify.
         scene: ranges of shape, texture and sensor of plain colons
         slam: quality of the simulated SLAM
+        errors: errors that neighbouring points or stretches of the path share, on top of those of the SLAM
         overwrite: Replace a folder made before.
     """
-    arguments = recorded(colon, output=output, layout=layout, spurious=spurious, scene=scene, slam=slam)
+    arguments = recorded(colon, output=output, layout=layout, spurious=spurious, scene=scene, slam=slam, errors=errors)
     slam = slam if spurious is None else replace(slam, spurious=spurious)
-    if not 0 <= slam.spurious < 1:
+    if slam.spurious is not None and not 0 <= slam.spurious < 1:
         raise InputError("--spurious", f"{slam.spurious}", "expected a share of at least 0 and below 1")
     if layout == "endomapper" and colon.lens == "c3vd":
         raise InputError("--layout endomapper", "it holds no Scaramuzza lens, as C3VD's is", "add --lens fisheye")
@@ -93,6 +96,8 @@ def synth(
         made = colon.rendered(scene, lambda *_: bar.advance()).frames
         if layout == "endomapper":  # which counts frames from 1
             made = [replace(frame, name=f"out{frame.number + 1}") for frame in made]
-        export = simulate_slam(made, slam, colon.seed)
-        write_synthetic(made, export, run.folder, layout)
+        right = simulate_slam(made, slam, colon.seed)
+        export = replace(right, map=with_errors(right.map, errors, colon.seed))
+        moved = None if errors == MapErrors() else moved_ids(right.map, export.map)
+        write_synthetic(made, export, run.folder, layout, moved)
         run.log(f"{colon.frames} frames, {len(export.map.submaps)} submaps in {output}")

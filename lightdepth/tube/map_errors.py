@@ -33,7 +33,7 @@ class MapErrors:
 
     drift: float = 1.0
     """Scale of each submap where its path begins, against 1 where it ends, as a factor; keyframes and points follow
-    it. The further from 1, the more the scale drifts."""
+    it. A larger one makes the beginning larger, one below 1 smaller than the end."""
     side_share: float = 0.0
     """Share of a submap's points, one side of the wall, that are moved away from the keyframes that saw them. A larger
     one moves a wider side."""
@@ -89,6 +89,12 @@ def with_errors(map_or_submap: Submap | SparseMap, errors: MapErrors, seed: int)
     if errors.pose_drift > 0 or errors.pose_drift_deg > 0:
         submap = pose_drift(submap, errors.pose_drift, errors.pose_drift_deg, errors.points_follow, poses)
     return submap if errors.drift == 1 else scale_drift(submap, errors.drift)
+
+
+def moved_ids(before: SparseMap, after: SparseMap) -> dict[int, np.ndarray]:
+    """Ids of the points that are elsewhere after errors, by submap id."""
+    pairs = zip(before.submaps, after.submaps, strict=True)
+    return {a.id: a.point_ids[(a.points != b.points).any(1)] for a, b in pairs}
 
 
 def scale_drift(submap: Submap, start: float) -> Submap:
