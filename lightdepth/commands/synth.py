@@ -14,6 +14,7 @@ from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import Lens, render_sequence
 from lightdepth.tube import lens as tube_lens
+from lightdepth.tube.breathing import BreathingConfig
 from lightdepth.tube.export import write_synthetic
 from lightdepth.tube.map_errors import MapErrors, moved_ids, with_errors
 from lightdepth.tube.scene import TubeConfig, realistic
@@ -48,7 +49,9 @@ class ColonConfig:
         if self.frames < 1:
             raise InputError("--frames", f"{self.frames}", "expected at least 1")
 
-    def rendered(self, scene: TubeConfig, progress: Callable[[int, int], None]) -> TubeSequence:
+    def rendered(
+        self, scene: TubeConfig, breathing: BreathingConfig, progress: Callable[[int, int], None]
+    ) -> TubeSequence:
         """The frames. Raises InputError where `scene` has ranges of its own and the family has others."""
         if self.family == "realistic":
             if scene != TubeConfig():
@@ -59,7 +62,15 @@ class ColonConfig:
         chosen = read_light(self.light) if self.light is not None else None
         camera = tube_lens(self.lens, *self.size)
         return render_sequence(
-            self.seed, self.frames, camera, self.travel_mm, scene, chosen, progress, device=self.device
+            self.seed,
+            self.frames,
+            camera,
+            self.travel_mm,
+            scene,
+            chosen,
+            progress,
+            device=self.device,
+            breathing=breathing,
         )
 
 
@@ -71,6 +82,7 @@ def synth(
     scene: TubeConfig = TubeConfig(),
     slam: SlamConfig = SlamConfig(),
     errors: MapErrors = MapErrors(),
+    breathing: BreathingConfig = BreathingConfig(),
     overwrite: bool = False,
 ) -> None:
     """A synthetic colon sequence with exact truth, and a multi-map SLAM export with known wrong points.
@@ -84,19 +96,30 @@ def synth(
         scene: ranges of shape, texture and sensor of plain colons
         slam: quality of the simulated SLAM
         errors: errors that neighbouring points or stretches of the path share, on top of those of the SLAM
+        breathing: how the wall moves from frame to frame; each frame's truth is its own
         overwrite: Replace a folder made before.
     """
-    arguments = recorded(colon, output=output, layout=layout, spurious=spurious, scene=scene, slam=slam, errors=errors)
+    arguments = recorded(
+        colon,
+        output=output,
+        layout=layout,
+        spurious=spurious,
+        scene=scene,
+        slam=slam,
+        errors=errors,
+        breathing=breathing,
+    )
     slam = slam if spurious is None else replace(slam, spurious=spurious)
     if slam.spurious is not None and not 0 <= slam.spurious < 1:
         raise InputError("--spurious", f"{slam.spurious}", "expected a share of at least 0 and below 1")
     if layout == "endomapper" and colon.lens == "c3vd":
         raise InputError("--layout endomapper", "it holds no Scaramuzza lens, as C3VD's is", "add --lens fisheye")
     with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", colon.frames) as bar:
-        made = colon.rendered(scene, lambda *_: bar.advance()).frames
+        sequence = colon.rendered(scene, breathing, lambda *_: bar.advance())
+        made = sequence.frames
         if layout == "endomapper":  # which counts frames from 1
             made = [replace(frame, name=f"out{frame.number + 1}") for frame in made]
-        right = simulate_slam(made, slam, colon.seed)
+        right = simulate_slam(made, slam, colon.seed, sequence.breathing)
         export = replace(right, map=with_errors(right.map, errors, colon.seed))
         moved = None if errors == MapErrors() else moved_ids(right.map, export.map)
         write_synthetic(made, export, run.folder, layout, moved)

@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
+from lightdepth.tube.breathing import Breathing
 from lightdepth.tube.map_errors import scale_drift
 from lightdepth.tube.observed import points_at_corners, projected, sees, true_pose
-from lightdepth.tube.tracked import distance_factors, tracks, wrong_factors
+from lightdepth.tube.tracked import at, distance_factors, tracks, wrong_factors
 
 Kind = Literal["tracked", "independent"]
 
@@ -106,12 +107,18 @@ class SimulatedSlam:
     spurious_ids: dict[int, np.ndarray]
 
 
-def simulate_slam(frames: Sequence[Frame], config: SlamConfig, seed: int) -> SimulatedSlam:
+def simulate_slam(
+    frames: Sequence[Frame], config: SlamConfig, seed: int, breathing: Breathing | None = None
+) -> SimulatedSlam:
     """Keyframes of frames with truth, corners as points, and each submap in a frame and scale of its own.
 
     A wrong point is moved along the ray of the keyframe that made it, by a factor of 1.3 + Exp(4) (independent), or of
-    the mean ray of those that observed it, by one beyond 1.3 either way (tracked).
+    the mean ray of those that observed it, by one beyond 1.3 either way (tracked). A wall that is `breathing` carries
+    its points along, and the map has them where they were in the mean of the keyframes that observed them; an
+    independent SLAM knows no such wall.
     """
+    if breathing is not None and config.kind == "independent":
+        raise InputError("--breathing.amplitude", "an independent SLAM", "expected --slam.kind tracked")
     settings = _Settings.of(config)
     rng = np.random.default_rng([seed, 1])
     keyframes = _keyframes(frames, settings.keyframe_every, rng)
@@ -124,7 +131,7 @@ def simulate_slam(frames: Sequence[Frame], config: SlamConfig, seed: int) -> Sim
     submaps, sims, wrong = [], {}, {}
     for map_id, part in enumerate(_parts(len(keyframes), config.maps, config.shared_keyframes)):
         chosen = [keyframes[i] for i in part]
-        submap, sims[map_id], wrong[map_id] = _submap(map_id, chosen, config, settings, rng)
+        submap, sims[map_id], wrong[map_id] = _submap(map_id, chosen, config, settings, rng, breathing)
         if settings.drift > 0:
             submap, sims[map_id] = _drifting(submap, chosen, sims[map_id], settings.drift, rng)
         submaps.append(submap)
@@ -148,11 +155,19 @@ _Similarity = tuple[float, np.ndarray, np.ndarray]
 
 
 def _submap(
-    map_id: int, frames: list[Frame], config: SlamConfig, settings: _Settings, rng: np.random.Generator
+    map_id: int,
+    frames: list[Frame],
+    config: SlamConfig,
+    settings: _Settings,
+    rng: np.random.Generator,
+    breathing: Breathing | None,
 ) -> tuple[Submap, _Similarity, np.ndarray]:
     """The submap, map_from_world, and the ids of its wrong points."""
-    observed = _tracked if config.kind == "tracked" else _independent
-    world, seen, origin, factor, pixels, wrong = observed(frames, config, settings, rng)
+    if config.kind == "tracked":
+        observed = _tracked(frames, config, settings, rng, breathing)
+    else:
+        observed = _independent(frames, config, settings, rng)
+    world, seen, origin, factor, pixels, wrong = observed
     noisy = origin + factor[:, None] * (world - origin)
 
     scale = float(np.exp(rng.uniform(np.log(0.02), np.log(0.5))))
@@ -186,11 +201,21 @@ class _Observed(NamedTuple):
     wrong: np.ndarray
 
 
-def _tracked(frames: list[Frame], config: SlamConfig, settings: _Settings, rng: np.random.Generator) -> _Observed:
+def _tracked(
+    frames: list[Frame],
+    config: SlamConfig,
+    settings: _Settings,
+    rng: np.random.Generator,
+    breathing: Breathing | None,
+) -> _Observed:
     count = settings.points or round(float(np.exp(rng.uniform(*np.log(_POINTS)))))
-    world, seen = tracks(frames, count, rng)
-    _check_points(world)
-    pixels = [projected(frame, world) + rng.normal(0, config.pixel_noise, (len(world), 2)) for frame in frames]
+    rest, seen = tracks(frames, count, rng, breathing)
+    _check_points(rest)
+    there = [at(frame, rest, breathing) for frame in frames]
+    pixels = [
+        projected(f, p) + rng.normal(0, config.pixel_noise, (len(rest), 2)) for f, p in zip(frames, there, strict=True)
+    ]
+    world = rest if breathing is None else (seen[..., None] * np.stack(there)).sum(0) / seen.sum(0)[:, None]
     centers = np.stack([true_pose(frame)[:3, 3] for frame in frames])
     origin = (seen.T / seen.sum(0)[:, None]) @ centers
     factor = distance_factors(

@@ -22,6 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lightdepth.frame import Frame
+from lightdepth.tube.breathing import Breathing
 from lightdepth.tube.observed import points_at_corners, projected, sees, true_pose
 
 _LOST = 0.2
@@ -30,24 +31,35 @@ _PARALLAX_POWER, _FREEDOM = 0.65, 4
 _MOST, _WRONG = float(np.log(1.25)), float(np.log(1.3))
 
 
-def tracks(frames: Sequence[Frame], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """World points (n, 3) and who observed them (frames, n) bool: up to `count` a frame, each by two at least."""
+def tracks(
+    frames: Sequence[Frame], count: int, rng: np.random.Generator, breathing: Breathing | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """World points (n, 3) and who observed them (frames, n) bool: up to `count` a frame, each by two at least.
+    The points of a wall that is `breathing` are given at rest."""
     world, seen = np.zeros((0, 3)), np.zeros((len(frames), 0), bool)
     for k, frame in enumerate(frames):
+        here = at(frame, world, breathing)
         if k:
             young = seen[: k - 1].sum(0) == 0  # a second look is what makes it a point
-            seen[k] = seen[k - 1] & sees(frame, world) & (young | (rng.random(len(world)) >= _LOST))
-        followed = projected(frame, world[seen[k]])
+            seen[k] = seen[k - 1] & sees(frame, here) & (young | (rng.random(len(world)) >= _LOST))
+        followed = projected(frame, here[seen[k]])
         new = points_at_corners(frame, count)
         if len(followed):
             apart = np.linalg.norm(projected(frame, new)[:, None] - followed, axis=-1).min(1) > 2
             new = new[apart]
         new = new[: max(0, count - len(followed))]
+        if breathing is not None:
+            new = breathing.at_rest(new, frame.time or 0.0)
         world = np.concatenate([world, new])
         seen = np.concatenate([seen, np.zeros((len(frames), len(new)), bool)], 1)
         seen[k, len(world) - len(new) :] = True
     kept = seen.sum(0) >= 2
     return world[kept], seen[:, kept]
+
+
+def at(frame: Frame, rest: np.ndarray, breathing: Breathing | None) -> np.ndarray:
+    """Where points (n, 3) of the wall at rest are when the frame is taken."""
+    return rest if breathing is None else breathing.at(rest, frame.time or 0.0)
 
 
 def distance_factors(
