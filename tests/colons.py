@@ -11,12 +11,14 @@ from lightdepth.camera import Pinhole
 from lightdepth.datasets import FrameSequence
 from lightdepth.frame import Frame
 from lightdepth.prediction import DepthPrediction
+from lightdepth.sparse_map import Submap
 from lightdepth.tube import ShapeConfig, TextureConfig, TubeConfig, TubeSequence, render_sequence
 from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
 
 SMALL = TubeConfig(ShapeConfig(length=90.0, step=1.2), TextureConfig(resolution=0.4))
 CAMERA = Pinhole(96, 80, 52.0, 52.0, 47.0, 41.0)
-EXACT = SlamConfig(spurious=0.0, point_noise=0.0, pixel_noise=0.0, pose_noise_mm=0.0, pose_noise_deg=0.0)
+INDEPENDENT = SlamConfig("independent")
+EXACT = replace(INDEPENDENT, spurious=0.0, point_noise=0.0, pixel_noise=0.0, pose_noise_mm=0.0, pose_noise_deg=0.0)
 
 
 @cache
@@ -25,9 +27,16 @@ def colon(seed: int = 0, count: int = 10, travel: float = 12.0, camera=CAMERA) -
     return render_sequence(seed, count, camera, travel, SMALL)
 
 
-def slam(frames, seed: int = 0, config: SlamConfig = SlamConfig(), **changes) -> SimulatedSlam:
+def slam(frames, seed: int = 0, config: SlamConfig = INDEPENDENT, **changes) -> SimulatedSlam:
     """A simulated SLAM of every frame, in one map, with `changes` to its configuration."""
     return simulate_slam(frames, replace(config, **{"keyframe_every": 1, "maps": 1, **changes}), seed)
+
+
+def in_world(found: SimulatedSlam, submap: Submap) -> np.ndarray:
+    """Points (n, 3) of a submap in the colon's own frame, mm."""
+    scale, rotation, translation = found.map_from_world[submap.id]
+    result: np.ndarray = (submap.points - translation) @ rotation / scale
+    return result
 
 
 def sequence(frames: list[Frame], source: str = "frames in memory") -> FrameSequence:

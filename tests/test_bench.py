@@ -33,7 +33,16 @@ def made(tmp_path_factory) -> Path:
         small = TubeConfig(ShapeConfig(length=90.0, step=1.2))
         patch.setattr(Scene, "colon", small)
         patch.setattr(command, "scenes", lambda size, first: [replace(TINY, seed=first)])
-        arguments = ["--image_size", "[64, 52]", "--checkpoints", "[decline]", "--wrong-shares", "[0.0, 0.3]"]
+        arguments = [
+            "--image_size",
+            "[64, 52]",
+            "--checkpoints",
+            "[decline]",
+            "--wrong-shares",
+            "[0.0, 0.3]",
+            "--cases",
+            "[side]",
+        ]
         assert bench(["-o", str(folder), *arguments, "--first-seed", "311"]) == 0
     return folder
 
@@ -43,16 +52,18 @@ def test_a_run_has_every_row_for_every_share_with_units_and_versions(made):
     assert found["kind"] == "bench" and found["suite_version"] == SUITE_VERSION and found["versions"]["numpy"]
     assert "mm" in found["unit"] and "Sim(3)" in found["alignment"] and found["config"]["first_seed"] == 311
     places = [(c["scene"], c["seed"], c["wrong_share"]) for c in found["cells"]]
-    assert places == [("tiny", 311, 0.0), ("tiny", 311, 0.3)]
-    for cell in found["cells"]:
+    assert places == [("tiny", 311, 0.0), ("tiny", 311, 0.3), ("tiny", 311, 0.03)]
+    for cell in found["cells"][:2]:
         assert list(cell["rows"]) == ["sparse map", "sparse inliers", "decline, paper", "decline, full"]
         assert cell["frames"] == 40 and cell["trajectory"]["keyframes"] == 5 and cell["trajectory"]["rms_ate_mm"] < 0.2
         dense = cell["rows"]["decline, full"]
         assert 0 < dense["median_mm"] <= dense["rms_mm"] < 10 and dense["keyframes_aligned"] == 5
         assert 0 <= dense["scale_error"] < 0.3 and 0 < dense["depth_abs_rel"] < 0.3
-    clean, dirty = (c["rows"] for c in found["cells"])
+    clean, dirty, erring = (c["rows"] for c in found["cells"])
     assert dirty["sparse map"]["rms_mm"] > 10 * clean["sparse map"]["rms_mm"]
     assert dirty["sparse inliers"]["rms_mm"] < 0.2 * dirty["sparse map"]["rms_mm"]
+    assert found["cells"][2]["case"] == "side" and list(erring) == ["sparse map", "decline, one scale", "decline, full"]
+    assert 0 < erring["decline, one scale"]["rms_mm"] < 20
     table = (made / "bench.md").read_text()
     assert "30% wrong points." in table and all(title in table for title in COLUMNS.values()) and "tiny (311)" in table
 
@@ -61,7 +72,8 @@ def test_a_run_compared_with_itself_is_within_noise(made, capsys, tmp_path):
     assert bench(["compare", str(made), str(made / "bench.json"), "-o", str(tmp_path / "c.json")]) == 0
     assert "B is within noise." in capsys.readouterr().out
     found = json.loads((tmp_path / "c.json").read_text())
-    assert found["verdict"] == "within noise" and found["paired"] and len(found["judged"]) == 10
+    assert found["verdict"] == "within noise" and found["paired"] and len(found["judged"]) == 20
+    assert {j["row"] for j in found["judged"]} >= {"decline, full", "decline, full (side)", "decline, one scale (side)"}
     for j in found["judged"]:
         none = 1 if j["change_is"] == "ratio" else 0
         assert j["change"] == none and j["low"] < none < j["high"]
@@ -81,6 +93,7 @@ def test_scenes_of_a_seed_are_the_same_and_their_names_are_not_those_of_other_si
         ({"wrong_shares": (0.1, 1.0)}, "expected shares of at least 0 and below 1"),
         ({"wrong_shares": (0.1, 0.1)}, "none twice"),
         ({"recipes": ()}, "at least one"),
+        ({"cases": ("side", "side")}, "none twice"),
         ({"image_size": (8, 8)}, "at least 32 pixels"),
         ({"first_seed": -1}, "expected 0 or more"),
     ],
@@ -169,6 +182,22 @@ def test_a_spread_larger_than_expected_widens_the_interval():
     calm = bootstrapped_mean(np.zeros(8), 0.1, 4, rng).std()
     wild = bootstrapped_mean(np.tile([-1.0, 1.0], 4), 0.1, 4, rng).std()
     assert wild > 3 * calm
+
+
+def test_cases_are_rows_of_their_own_and_a_run_without_them_can_still_be_compared(tmp_path):
+    a, b = written(tmp_path / "a"), written(tmp_path / "b")
+    for folder, factor in ((a, 1), (b, 4)):
+        data = json.loads((folder / "bench.json").read_text())
+        figures = {"net, full": {k: v * factor for k, v in FIGURES.items()} | COUNTS}
+        for i in range(2):
+            data["cells"].append(
+                {"scene": f"short{i}", "seed": 400 + i, "wrong_share": 0.03, "case": "side", "rows": figures}
+            )
+        (folder / "bench.json").write_text(json.dumps(data))
+    found = compared(a, b)
+    assert found.of_row("net, full (side)") == "worse" and found.of_row("net, full") == "within noise"
+    without = compared(written(tmp_path / "old"), b)
+    assert without.unmatched == ("net, full (side)",) and without.verdict == "within noise"
 
 
 def test_cells_without_figures_are_left_out_and_said(tmp_path):

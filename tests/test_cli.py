@@ -16,10 +16,12 @@ from scenes import cylinder
 from lightdepth.camera import Pinhole
 from lightdepth.cli import main
 from lightdepth.datasets import FORMATS, write_folder
+from lightdepth.maps import read_map
 from lightdepth.photometry import PhotometricCalibration
 
 HEAVY = ("torch", "numpy", "cv2", "open3d", "pycolmap", "scipy", "jsonargparse", "matplotlib")
 SMALL = ["--scene.shape.step", "1.2", "--scene.shape.length", "90", "--scene.texture.resolution", "0.4"]
+SMALL += ["--slam.kind", "independent"]
 
 
 def lightdepth(*argv: object) -> int:
@@ -121,6 +123,7 @@ def frames(data, tmp_path_factory) -> Path:
 
 def test_synth_draws_realistic_colons_too_and_they_have_ranges_of_their_own(tmp_path, capsys):
     argv = ["--lens", "pinhole", "--frames", 4, "--size", "[64, 48]", "--slam.keyframe_every", 1]
+    argv += ["--slam.kind", "independent"]
     for family in ("plain", "realistic"):
         assert lightdepth("synth", *argv, "--family", family, "-o", tmp_path / family) == 0
     first, second = (cv2.imread(str(tmp_path / f / "frames" / "000000.png")) for f in ("plain", "realistic"))
@@ -234,6 +237,16 @@ def test_output_is_o_and_dashes_are_underscores(output, tmp_path):
     assert slam["points_per_keyframe"] == 60
 
 
+def test_errors_that_come_together_are_options_and_the_truth_names_the_points_that_moved(tmp_path):
+    argv = ["--frames", 4, "--size", "[48, 40]", "--slam.maps", 1, "--slam.keyframe_every", 1, "--travel_mm", 3]
+    extra = ["--errors.side_share", 0.25, "--errors.side_factor", 1.2]
+    assert lightdepth("synth", "-o", tmp_path / "a", *argv, *SMALL, *extra) == 0
+    known = json.loads((tmp_path / "a" / "truth" / "slam.json").read_text())["0"]
+    (submap,) = read_map(tmp_path / "a" / "slam").submaps
+    assert len(known["moved_point_ids"]) == round(0.25 * len(submap.points))
+    assert lightdepth("synth", "-o", tmp_path / "b", *argv, *SMALL, "--errors.side_share", 2) in (2, 3)
+
+
 def test_the_share_of_wrong_points_can_be_given_either_way(tmp_path):
     argv = ["--frames", 4, "--size", "[48, 40]", "--slam.maps", 1, "--slam.keyframe_every", 1, "--travel_mm", 3]
     for name, option in (("a", "--spurious"), ("b", "--slam.spurious")):
@@ -342,7 +355,7 @@ def test_a_checkpoint_that_is_none_is_found_out_before_a_sparse_map_is_made(fram
 def test_frames_without_a_map_are_mapped_and_made_dense(tmp_path, capfd):
     """The way for those who have no SLAM: pycolmap makes the map."""
     argv = ["--frames", 8, "--size", "[240, 192]", "--travel-mm", 7, "--lens", "pinhole"]
-    shape = ["--scene.shape.step", "1.2", "--scene.shape.length", "90"]
+    shape = ["--scene.shape.step", "1.2", "--scene.shape.length", "90", "--slam.kind", "independent"]
     assert lightdepth("synth", "-o", tmp_path / "seq", *argv, *shape) == 0
     shutil.rmtree(tmp_path / "seq" / "slam")
     assert lightdepth("densify", tmp_path / "seq", "--checkpoint", "decline", "-o", tmp_path / "out") == 0

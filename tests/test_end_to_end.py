@@ -34,6 +34,7 @@ def test_a_checkpoint_trained_on_colons_densifies_another_colon(tmp_path, capsys
     assert losses[-1] < losses[0], losses
 
     synth = ["synth", "-o", tmp_path / "colon", "--seed", 901, "--frames", 12, "--size", "[160,128]", "--travel-mm", 10]
+    synth += ["--slam.kind", "independent"]
     assert main([str(a) for a in synth]) == 0
     checkpoint = tmp_path / "run" / "model.safetensors"
     densify = ["densify", tmp_path / "colon", "--map", tmp_path / "colon" / "slam", "--checkpoint", checkpoint]

@@ -162,7 +162,8 @@ def test_bare_intrinsics_are_for_the_size_of_the_images(folder, tmp_path):
 def test_synth_makes_a_sequence_whose_frames_map_and_truth_go_by_the_same_numbers(tmp_path):
     shape, texture = SMALL.shape, SMALL.texture
     argv = ["--layout", "endomapper", "--lens", "fisheye", "--frames", "5", "--size", "[96, 72]", "--travel-mm", "6"]
-    argv += ["--slam.maps", "1", "--scene.shape.length", str(shape.length), "--scene.shape.step", str(shape.step)]
+    argv += ["--slam.kind", "independent", "--slam.maps", "1"]
+    argv += ["--scene.shape.length", str(shape.length), "--scene.shape.step", str(shape.step)]
     argv += ["--scene.texture.resolution", str(texture.resolution)]
     assert main(["synth", "-o", str(tmp_path / "out"), *argv]) == 0
     read, truth = open_sequence(tmp_path / "out" / "sequence"), open_sequence(tmp_path / "out" / "truth" / "sequence")

@@ -107,7 +107,7 @@ def test_a_moved_keyframe_sees_the_moved_points_where_it_saw_them():
 
 
 def test_maps_that_share_frames_meet_by_the_points_seen_in_them_whatever_their_ids_and_wrong_points():
-    maps, true = halves(0, 3, SlamConfig(spurious=0.3))
+    maps, true = halves(0, 3, SlamConfig("independent", spurious=0.3))
     found = meeting([bare(m.submap) for m in maps], POINTS)
     assert [set(g) for g in found.groups] == [{0, 1}] and [j.by for j in found.joins] == ["points"]
     (group,) = found.groups

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from colons import CAMERA, EXACT, SMALL, colon, slam
+from colons import CAMERA, EXACT, SMALL, colon, in_world, slam
 from raising import refused
 
 from lightdepth.camera import KannalaBrandt, Pinhole, Scaramuzza
@@ -193,11 +193,6 @@ def test_the_share_of_wrong_points_is_as_asked():
         assert set(wrong) <= set(submap.point_ids)
 
 
-def in_world(found, submap) -> np.ndarray:
-    scale, rotation, translation = found.map_from_world[submap.id]
-    return (submap.points - translation) @ rotation / scale
-
-
 def test_wrong_points_are_off_the_wall_and_right_ones_on_it():
     sequence = colon(0)
     found = slam(sequence.frames, spurious=0.3, pose_noise_mm=0.0, point_noise=0.005)
@@ -235,7 +230,7 @@ def test_observed_points_reproject_within_the_noise(noise):
 
 def test_neighbouring_submaps_share_as_many_keyframes_as_asked():
     for shared in (0, 2, 3):
-        config = SlamConfig(keyframe_every=1, maps=2, shared_keyframes=shared)
+        config = SlamConfig("independent", keyframe_every=1, maps=2, shared_keyframes=shared)
         submaps = simulate_slam(colon(0).frames, config, 0).map.submaps
         first, second = ({k.number for k in s.keyframes} for s in submaps)
         assert len(first & second) == shared and first | second == set(range(10))
@@ -255,7 +250,7 @@ def test_keyframes_are_every_so_manyth_frame():
 def test_a_slam_that_is_impossible_is_refused():
     frames = colon(0).frames
     with refused(where="2 maps", found="3 keyframes cannot be shared among"):
-        simulate_slam(frames[:3], SlamConfig(keyframe_every=1), 0)
+        simulate_slam(frames[:3], SlamConfig("independent", keyframe_every=1), 0)
     with refused(where="000000", found="no true distance or no true pose"):
         slam([replace(f, true_world_from_cam=None) for f in frames])
     black = [replace(f, image=np.zeros_like(f.image)) for f in frames]

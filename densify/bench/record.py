@@ -1,6 +1,7 @@
 """bench.json and bench.md: what a run of the benchmark found, and by what.
 
-bench.json has one cell for each scene and share of wrong points, and in it the figures of each row; distances in mm.
+bench.json has one cell for each scene and share of wrong points, or case of errors that come together, and in it the
+figures of each row; distances in mm.
 """
 
 from __future__ import annotations
@@ -47,12 +48,13 @@ _ALSO_COMPARED = ("depth_abs_rel", "scale_error", "keyframes", "keyframes_aligne
 
 
 class Cell(BaseModel):
-    """One scene at one share of wrong points: a row has figures, or `error`, the reason why it has none."""
+    """One scene at one share of wrong points, or in one case: a row has figures, or `error`, why it has none."""
 
     model_config = ConfigDict(extra="ignore")
     scene: str
     seed: int
     wrong_share: Annotated[float, Field(ge=0, lt=1)]
+    case: str = ""
     rows: dict[str, dict[str, Any]]
 
 
@@ -123,12 +125,12 @@ def figure(row: Mapping[str, Any], key: str) -> float | None:
 
 
 def tables(found: Mapping[str, Any]) -> list[Table]:
-    """One table for each share of wrong points laid out as the paper's table 2, and the SLAM's as its table 1."""
+    """One table for each share of wrong points and each case, as the paper's table 2, and the SLAM's as its table 1."""
     cells = found["cells"]
-    shares = list(dict.fromkeys(cell["wrong_share"] for cell in cells))
+    kinds = list(dict.fromkeys((cell.get("case", ""), cell["wrong_share"]) for cell in cells))
     made = [_slam_table(cells)]
-    for share in shares:
-        of = [cell for cell in cells if cell["wrong_share"] == share]
+    for case, share in kinds:
+        of = [cell for cell in cells if (cell.get("case", ""), cell["wrong_share"]) == (case, share)]
         rows: list[list[Any]] = []
         for name in of[0]["rows"]:
             for key, title in COLUMNS.items():
@@ -136,7 +138,8 @@ def tables(found: Mapping[str, Any]) -> list[Table]:
                 if any(v is not None for v in values):
                     rows.append([name, title, *values, *_mean(values)])
         average = ["avg"] if len(of) > 1 else []
-        title = f"{share:.0%} wrong points. Accuracy: each model point to the closest true point."
+        named = f"Errors that come together: {case}; " if case else ""
+        title = f"{named}{share:.0%} wrong points. Accuracy: each model point to the closest true point."
         made.append(Table(title, ["Method", "Metrics", *(_column(cell) for cell in of), *average], rows))
     return made
 
@@ -176,5 +179,6 @@ def notes(found: Mapping[str, Any]) -> list[str]:
     for cell in found["cells"]:
         for name, row in cell["rows"].items():
             if "error" in row:
-                said.append(f"{cell['scene']}, {cell['wrong_share']:.0%} wrong, {name}: {row['error']}.")
+                place = cell.get("case") or f"{cell['wrong_share']:.0%} wrong"
+                said.append(f"{cell['scene']}, {place}, {name}: {row['error']}.")
     return said

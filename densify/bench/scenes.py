@@ -14,7 +14,9 @@ import numpy as np
 
 from densify.evaluation.truth import Truth, read_truth
 from lightdepth.datasets import FrameSequence
+from lightdepth.sparse_map import SparseMap
 from lightdepth.tube import ShapeConfig, Tube, TubeConfig, lens, realistic, render_sequence
+from lightdepth.tube.map_errors import MapErrors, with_errors
 from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
 from lightdepth.tube.variant import VariantTube
 
@@ -53,6 +55,8 @@ class Scene:
 
 _POINTS = 2000
 """Of the sparse map of a short sequence, as in the paper's table 2."""
+_TRACKED = 500
+"""Points that a keyframe of a SLAM like a real one observes at most."""
 _WIDE, _STRONG, _WEAK = (0.0, 1.0), (0.5, 0.7), (0.0, 0.2)
 _SHORT = (  # frames and keyframes are t2a's to s3a's of the paper
     Scene("short1", 0, 194, 16, travel_mm=20, reflectance=_WEAK),
@@ -82,10 +86,15 @@ class Rendered:
     frames: FrameSequence
     truth: Truth
 
+    def tracked(self, wrong_share: float, errors: MapErrors) -> SparseMap:
+        """What a SLAM like a real one makes of it, with errors that come together."""
+        config = SlamConfig("tracked", 1, self.scene.maps, points_per_keyframe=_TRACKED, spurious=wrong_share)
+        return with_errors(simulate_slam(list(self.frames), config, self.scene.seed).map, errors, self.scene.seed)
+
     def slam(self, wrong_share: float) -> SimulatedSlam:
         """The SLAM's export with a share of wrong points."""
         new = round(_POINTS / min(self.scene.keyframes, 20))
-        config = SlamConfig(1, self.scene.maps, points_per_keyframe=new, spurious=wrong_share)
+        config = SlamConfig("independent", 1, self.scene.maps, points_per_keyframe=new, spurious=wrong_share)
         return simulate_slam(list(self.frames), config, self.scene.seed)
 
 

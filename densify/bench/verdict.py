@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -151,10 +151,11 @@ def compare(a: BenchFile, b: BenchFile, seed: int = 0) -> Comparison:
     for key in ("size", "image_size", "screening_share"):
         if a.config.get(key) != b.config.get(key):
             raise InputError(key, f"{a.config.get(key)} in A, {b.config.get(key)} in B", "run both with the same")
-    places = [{(c.scene, c.wrong_share): c for c in run.cells} for run in (a, b)]
-    if set(places[0]) != set(places[1]):
-        scene, share = sorted(set(places[0]) ^ set(places[1]))[0]
-        which = "A" if (scene, share) in places[0] else "B"
+    places = [{(c.scene, c.wrong_share, c.case): c for c in run.cells} for run in (a, b)]
+    apart = sorted(place for place in set(places[0]) ^ set(places[1]) if not place[2])  # cases are rows of their own
+    if apart:
+        scene, share, _ = apart[0]
+        which = "A" if apart[0] in places[0] else "B"
         raise InputError(which, f"{scene} at {share:.0%} wrong points is in it alone", "run both with the same shares")
     same = [name for name, number in a.seeds.items() if b.seeds[name] == number]
     if same and len(same) < len(a.seeds):
@@ -163,13 +164,14 @@ def compare(a: BenchFile, b: BenchFile, seed: int = 0) -> Comparison:
             f"{len(same)} of {len(a.seeds)} scenes have the same seed in both runs",
             "expected all (paired) or none",
         )
-    rows = [list(dict.fromkeys(r for c in run.cells for r in c.rows if r not in (SPARSE, INLIERS))) for run in (a, b)]
+    rows = [[*dict.fromkeys(_Row(c.case, r) for c in run.cells for r in c.rows)] for run in (a, b)]
+    rows = [[row for row in of if row.name not in (SPARSE, INLIERS)] for of in rows]
     common = [row for row in rows[0] if row in rows[1]]
     if not common:
         raise InputError(
             "rows of A and B",
             "none is in both",
-            f"run both with the same: A has {'; '.join(rows[0])}; B has {'; '.join(rows[1])}",
+            f"run both with the same: A has {'; '.join(map(str, rows[0]))}; B has {'; '.join(map(str, rows[1]))}",
         )
     spread = SAME_COLONS if same else OTHER_COLONS
     tail = (1 - LEVEL) / 2 / (len(common) * len(spread.deviation))
@@ -177,21 +179,32 @@ def compare(a: BenchFile, b: BenchFile, seed: int = 0) -> Comparison:
     for row in common:
         for key in spread.deviation:
             values = [
-                {place: compared_value(cell.rows.get(row), key) for place, cell in cells.items()} for cells in places
+                {p: compared_value(cell.rows.get(row.name), key) for p, cell in cells.items() if cell.case == row.case}
+                for cells in places
             ]
             rng = np.random.default_rng([seed, len(judged)])
-            found = _judge(row, key, values, spread, tail, rng)
+            found = _judge(str(row), key, values, spread, tail, rng)
             if found is not None:
                 judged.append(found)
     if not judged:
         raise InputError(
             "rows of A and B", "none has figures for the same scenes in both runs", "their bench.md say why"
         )
-    unmatched = tuple(row for row in dict.fromkeys((*rows[0], *rows[1])) if row not in common)
+    unmatched = tuple(str(row) for row in dict.fromkeys((*rows[0], *rows[1])) if row not in common)
     return Comparison(bool(same), tuple(judged), _changed(a.config, b.config), unmatched)
 
 
-_Place = tuple[str, float]
+class _Row(NamedTuple):
+    """A row of the cells of one case of errors that come together, or of those that have none."""
+
+    case: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.case})" if self.case else self.name
+
+
+_Place = tuple[str, float, str]
 _ADDITIVE = ("scale_error", "unaligned_share")
 
 
@@ -213,7 +226,7 @@ def _judge(
     both = [place for place in first if place in second]
     if not both:
         return None
-    scenes = list(dict.fromkeys(scene for scene, _ in both))
+    scenes = list(dict.fromkeys(scene for scene, *_ in both))
     of_scene = [[p for p in both if p[0] == scene] for scene in scenes]
     x_a = np.array([np.mean([first[p] for p in places]) for places in of_scene])
     x_b = np.array([np.mean([second[p] for p in places]) for places in of_scene])

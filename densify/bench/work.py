@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from densify.bench.cases import CASES, WRONG_SHARE, Case
 from densify.bench.scenes import Rendered, Scene, Size, render
 from densify.config import DensifyConfig, Recipe
 from densify.dense_map import DenseMap
@@ -31,6 +32,8 @@ from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Submap
 
 SPARSE, INLIERS = "sparse map", "sparse inliers"
+WAYS = ("one scale", "full")
+"""In which each case is made dense: without bending, and as densify does it."""
 SHARES: dict[Size, tuple[float, ...]] = {"small": (0.1, 0.45), "full": (0.0, 0.1, 0.3, 0.45)}
 IMAGE_SIZE: dict[Size, tuple[int, int]] = {"small": (160, 128), "full": (320, 256)}
 
@@ -53,15 +56,18 @@ class BenchConfig:
     """Models to compare: paths, names of bundled ones, decline (the closed form) or constant."""
     recipes: tuple[Recipe, ...] = ("paper", "full")
     """Ways to make dense maps that are compared: paper, full, or both."""
+    cases: tuple[Case, ...] = ()
+    """Map errors that come together (densify.bench.cases), each a cell of its own in the short sequences, made dense by
+    the last model with one scale a keyframe and in full. More cases take longer."""
     image_size: tuple[int, int] = IMAGE_SIZE["small"]
     """Width and height of the keyframes, pixels. A larger one takes longer."""
     densify: DensifyConfig = field(default_factory=lambda: DensifyConfig(judge=JudgeConfig(on=False)))
     """How dense maps are made, for all dense rows but for their recipe."""
 
     def __post_init__(self) -> None:
-        for name in ("wrong_shares", "checkpoints", "recipes"):
+        for name in ("wrong_shares", "checkpoints", "recipes", "cases"):
             given = getattr(self, name)
-            if not given or len(set(given)) < len(given):
+            if (not given and name != "cases") or len(set(given)) < len(given):
                 raise InputError(name, f"{list(given)}", "expected at least one, and none twice")
         if not all(0 <= share < 1 for share in (*self.wrong_shares, self.screening_share)):
             raise InputError("wrong_shares", f"{list(self.wrong_shares)}", "expected shares of at least 0 and below 1")
@@ -72,6 +78,14 @@ class BenchConfig:
 
     def shares(self, scene: Scene) -> tuple[float, ...]:
         return self.wrong_shares if scene.maps == 1 else (self.screening_share,)
+
+    def cases_of(self, scene: Scene) -> tuple[Case, ...]:
+        return self.cases if scene.maps == 1 else ()
+
+    def rows_of(self, scene: Scene) -> int:
+        """How many dense maps are made of a scene."""
+        of_shares = len(self.shares(scene)) * len(self.checkpoints) * len(self.recipes)
+        return of_shares + len(self.cases_of(scene)) * len(WAYS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +179,7 @@ class RowFigures:
 
 @dataclass(frozen=True)
 class CellFigures:
-    """One scene at one share of wrong points."""
+    """One scene at one share of wrong points, or in one case of errors that come together."""
 
     scene: str
     """name of the scene"""
@@ -179,17 +193,38 @@ class CellFigures:
     """what the SLAM made of it"""
     rows: Mapping[str, RowFigures]
     """the surfaces, by the name of the row"""
+    case: str = ""
+    """name of the case of errors that come together; empty where each point is wrong on its own"""
 
     def record(self) -> dict[str, object]:
         """As bench.json has it."""
         shared = {"scene": self.scene, "seed": self.seed, "wrong_share": self.wrong_share, "frames": self.frames}
+        shared |= {"case": self.case} if self.case else {}
         rows = {name: row.record() for name, row in self.rows.items()}
         return {**shared, "trajectory": asdict(self.trajectory), "rows": rows}
 
 
 def run_scene(scene: Predicted, config: BenchConfig, on_row: Callable[[], None] = lambda: None) -> list[CellFigures]:
-    """The cells of a scene, one for each share of wrong points. A row that cannot be judged says why."""
-    return [_cell(scene, share, config, on_row) for share in config.shares(scene.rendered.scene)]
+    """The cells of a scene, one for each share of wrong points and each case. A row that cannot be judged says why."""
+    of = scene.rendered.scene
+    cells = [_cell(scene, share, config, on_row) for share in config.shares(of)]
+    return cells + [_case_cell(scene, case, config, on_row) for case in config.cases_of(of)]
+
+
+def _case_cell(scene: Predicted, case: Case, config: BenchConfig, on_row: Callable[[], None]) -> CellFigures:
+    rendered = scene.rendered
+    sparse_map = rendered.tracked(WRONG_SHARE, CASES[case])
+    sparse = [_model(s, sparse=s.points) for s in sparse_map.submaps]
+    model, known = list(scene.predictions.items())[-1]
+    rows = {SPARSE: _judged(sparse, rendered, "sparse")}
+    for way in WAYS:
+        full = config.densify.under("full")
+        chosen = full if way == "full" else full.rigid()
+        made = [r.dense for r in densify(rendered.frames, sparse_map, partial(_known, known), chosen)]
+        rows[f"{model}, {way}"] = _dense_row(made, rendered, known)
+        on_row()
+    seen, slam = rendered.scene, _trajectory(sparse, rendered)
+    return CellFigures(seen.name, seen.seed, WRONG_SHARE, seen.frames, slam, rows, case)
 
 
 def _cell(scene: Predicted, share: float, config: BenchConfig, on_row: Callable[[], None]) -> CellFigures:

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
+from densify.bench.cases import USUAL_CASES, Case
 from densify.bench.estimators import (
     NO_LIBRARY,
     EstimatorsConfig,
@@ -49,6 +50,7 @@ def run(
     wrong_shares: tuple[float, ...] | None = None,
     checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT),
     recipes: tuple[Recipe, ...] = ("paper", "full"),
+    cases: tuple[Case, ...] | None = None,
     image_size: tuple[int, int] | None = None,
     method: Group[OfflineConfig] = OfflineConfig(),
     overwrite: bool = False,
@@ -64,6 +66,8 @@ def run(
             out, those of the size. More shares take longer.
         checkpoints: Depth models to compare: paths, names of bundled ones, decline (the closed form) or constant.
         recipes: Ways to make surfaces that are compared: full, paper, or both.
+        cases: Map errors that come together, each judged with one scale a keyframe and in full: clean, side, wide side,
+            drift, fold, poses; left out, those of the size. More cases take longer.
         image_size: Width and height of the keyframes, pixels; left out, that of the size. A larger one takes longer.
         overwrite: Replace a run made before.
     """
@@ -75,6 +79,7 @@ def run(
         wrong_shares=wrong_shares,
         checkpoints=checkpoints,
         recipes=recipes,
+        cases=cases,
         image_size=image_size,
     )
     config = BenchConfig(
@@ -83,6 +88,7 @@ def run(
         wrong_shares or SHARES[size],
         checkpoints=checkpoints,
         recipes=recipes,
+        cases=USUAL_CASES[size] if cases is None else cases,
         image_size=image_size or IMAGE_SIZE[size],
         densify=DensifyConfig(**vars(method), judge=JudgeConfig(on=False)),
     )
@@ -99,10 +105,9 @@ def run(
 def _cells(config: BenchConfig, models: Sequence[DepthModel]) -> tuple[list[CellFigures], dict[str, float]]:
     """The cells of all scenes, and the seconds that each scene took."""
     chosen = scenes(config.size, config.first_seed)
-    rows = len(models) * len(config.recipes)
     cells: list[CellFigures] = []
     seconds: dict[str, float] = {}
-    with Progress("Benchmark", sum(rows * len(config.shares(s)) * s.keyframes for s in chosen)) as bar:
+    with Progress("Benchmark", sum(config.rows_of(s) * s.keyframes for s in chosen)) as bar:
         for scene in chosen:
             start = time.perf_counter()
             seen = predicted(scene, config.image_size, models)

@@ -60,7 +60,7 @@ def demo(
             sequence = render_sequence(
                 seed, frames, tube_lens(lens, *size), 0.7 * frames, progress=lambda *_: bar.advance()
             )
-        slam = simulate_slam(sequence.frames, SlamConfig(spurious=spurious), seed)
+        slam = simulate_slam(sequence.frames, SlamConfig("independent", spurious=spurious), seed)
         write_synthetic(sequence.frames, slam, run.folder / "data")
         data = open_sequence(run.folder / "data")
         sparse_map = read_map(run.folder / "data" / "slam")

@@ -14,7 +14,9 @@ from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import Lens, render_sequence
 from lightdepth.tube import lens as tube_lens
+from lightdepth.tube.breathing import BreathingConfig
 from lightdepth.tube.export import write_synthetic
+from lightdepth.tube.map_errors import MapErrors, moved_ids, with_errors
 from lightdepth.tube.scene import TubeConfig, realistic
 from lightdepth.tube.sequence import TubeSequence
 from lightdepth.tube.slam import SlamConfig, simulate_slam
@@ -26,14 +28,14 @@ class ColonConfig:
 
     lens: Lens = "c3vd"
     """Lens of the endoscope: pinhole, telescope, fisheye or c3vd."""
-    frames: int = 40
+    frames: int = 120
     """Number of frames to render, spread evenly over --travel_mm. More lie closer together on the same path, and take
     longer."""
     size: tuple[int, int] = (320, 256)
     """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
     seed: int = 0
     """Number that draws the colon, its light and the path. Another one draws another colon."""
-    travel_mm: float = 30.0
+    travel_mm: float = 36.0
     """Length of the path along the colon, mm. A longer one makes neighbouring frames less alike."""
     light: str | None = None
     """Light to have instead of a drawn one: light.json, or gamma=2.2,mu=0."""
@@ -47,7 +49,9 @@ class ColonConfig:
         if self.frames < 1:
             raise InputError("--frames", f"{self.frames}", "expected at least 1")
 
-    def rendered(self, scene: TubeConfig, progress: Callable[[int, int], None]) -> TubeSequence:
+    def rendered(
+        self, scene: TubeConfig, breathing: BreathingConfig, progress: Callable[[int, int], None]
+    ) -> TubeSequence:
         """The frames. Raises InputError where `scene` has ranges of its own and the family has others."""
         if self.family == "realistic":
             if scene != TubeConfig():
@@ -58,7 +62,15 @@ class ColonConfig:
         chosen = read_light(self.light) if self.light is not None else None
         camera = tube_lens(self.lens, *self.size)
         return render_sequence(
-            self.seed, self.frames, camera, self.travel_mm, scene, chosen, progress, device=self.device
+            self.seed,
+            self.frames,
+            camera,
+            self.travel_mm,
+            scene,
+            chosen,
+            progress,
+            device=self.device,
+            breathing=breathing,
         )
 
 
@@ -69,6 +81,8 @@ def synth(
     spurious: float | None = None,
     scene: TubeConfig = TubeConfig(),
     slam: SlamConfig = SlamConfig(),
+    errors: MapErrors = MapErrors(),
+    breathing: BreathingConfig = BreathingConfig(),
     overwrite: bool = False,
 ) -> None:
     """A synthetic colon sequence with exact truth, and a multi-map SLAM export with known wrong points.
@@ -81,18 +95,32 @@ def synth(
             to densify.
         scene: ranges of shape, texture and sensor of plain colons
         slam: quality of the simulated SLAM
+        errors: errors that neighbouring points or stretches of the path share, on top of those of the SLAM
+        breathing: how the wall moves from frame to frame; each frame's truth is its own
         overwrite: Replace a folder made before.
     """
-    arguments = recorded(colon, output=output, layout=layout, spurious=spurious, scene=scene, slam=slam)
+    arguments = recorded(
+        colon,
+        output=output,
+        layout=layout,
+        spurious=spurious,
+        scene=scene,
+        slam=slam,
+        errors=errors,
+        breathing=breathing,
+    )
     slam = slam if spurious is None else replace(slam, spurious=spurious)
-    if not 0 <= slam.spurious < 1:
+    if slam.spurious is not None and not 0 <= slam.spurious < 1:
         raise InputError("--spurious", f"{slam.spurious}", "expected a share of at least 0 and below 1")
     if layout == "endomapper" and colon.lens == "c3vd":
         raise InputError("--layout endomapper", "it holds no Scaramuzza lens, as C3VD's is", "add --lens fisheye")
     with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", colon.frames) as bar:
-        made = colon.rendered(scene, lambda *_: bar.advance()).frames
+        sequence = colon.rendered(scene, breathing, lambda *_: bar.advance())
+        made = sequence.frames
         if layout == "endomapper":  # which counts frames from 1
             made = [replace(frame, name=f"out{frame.number + 1}") for frame in made]
-        export = simulate_slam(made, slam, colon.seed)
-        write_synthetic(made, export, run.folder, layout)
+        right = simulate_slam(made, slam, colon.seed, sequence.breathing)
+        export = replace(right, map=with_errors(right.map, errors, colon.seed))
+        moved = None if errors == MapErrors() else moved_ids(right.map, export.map)
+        write_synthetic(made, export, run.folder, layout, moved)
         run.log(f"{colon.frames} frames, {len(export.map.submaps)} submaps in {output}")

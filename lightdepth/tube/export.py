@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from lightdepth.datasets import write_c3vd, write_endomapper, write_folder
 from lightdepth.frame import Frame
@@ -13,9 +15,15 @@ from lightdepth.reporting.run import plain
 from lightdepth.tube.slam import SimulatedSlam
 
 
-def write_synthetic(frames: Sequence[Frame], export: SimulatedSlam, folder: Path, layout: str = "frames") -> None:
+def write_synthetic(
+    frames: Sequence[Frame],
+    export: SimulatedSlam,
+    folder: Path,
+    layout: str = "frames",
+    moved: Mapping[int, np.ndarray] | None = None,
+) -> None:
     """The sequence (with truth) at `folder`, the SLAM export in slam/, what only the simulation knows in
-    truth/slam.json."""
+    truth/slam.json, among it the ids of points `moved` by errors that come together, by submap id."""
     if layout == "c3vd":
         write_c3vd(frames, folder / "sequence")
     elif layout == "endomapper":
@@ -28,6 +36,7 @@ def write_synthetic(frames: Sequence[Frame], export: SimulatedSlam, folder: Path
         str(i): {
             "map_from_world": {"scale": s, "rotation": r.tolist(), "translation": t.tolist()},
             "spurious_point_ids": export.spurious_ids[i].tolist(),
+            **({} if moved is None else {"moved_point_ids": moved[i].tolist()}),
         }
         for i, (s, r, t) in export.map_from_world.items()
     }

@@ -14,6 +14,7 @@ Notation of tensors: B views, P pixels inside the mask, N patches; vectors (B, 3
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -179,6 +180,15 @@ class Tube:
     _make_shape = staticmethod(make_shape)
     _make_texture = staticmethod(make_texture)
     _expose = staticmethod(expose)
+
+    def reshaped(self, shape: TubeShape) -> Tube:
+        """The same paint and endoscope on a wall of another shape, of as many rings and spokes."""
+        other = copy(self)
+        vars(other).pop("_on_cpu", None)
+        other.shape, other._normals = shape, self._map(shape.normals)
+        other._caster = make_caster(shape.vertices.reshape(-1, 3), shape.faces, self.device)
+        other._patches = other._make_patches()
+        return other
 
     def view(
         self, world_from_cam: np.ndarray, camera: CameraModel, mask: np.ndarray, rng: np.random.Generator

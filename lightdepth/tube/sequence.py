@@ -10,6 +10,7 @@ import numpy as np
 from lightdepth.camera import CameraModel
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.tube.breathing import Breathing, BreathingConfig
 from lightdepth.tube.casting import rendering_device
 from lightdepth.tube.path import camera_path, lens, octagon
 from lightdepth.tube.scene import Tube, TubeConfig
@@ -19,10 +20,11 @@ _PIXELS_AT_ONCE = {"cpu": 500_000, "cuda": 4_000_000}  # some 200 MB, and 2 GB
 
 @dataclass(frozen=True)
 class TubeSequence:
-    """Rendered frames and the colon they were rendered from."""
+    """Rendered frames, the colon they were rendered from, and how its wall moves; None where it rests."""
 
     frames: list[Frame]
     tube: Tube
+    breathing: Breathing | None = None
 
 
 def render_sequence(
@@ -36,21 +38,27 @@ def render_sequence(
     kind: type[Tube] = Tube,
     mask: np.ndarray | None = None,
     device: str = "auto",
+    breathing: BreathingConfig | None = None,
 ) -> TubeSequence:
     """A colon drawn from `seed`, seen in `count` frames along `travel` mm. Frames carry the light's true calibration
     with gain 1 (exposure is automatic, so the true gain differs per frame), distance and pose in mm. `mask` (H, W) is
     the field of view, an octagon if left out. Rendered on `device` (auto: the GPU where there is one) in batches: a
-    seed gives the same frames everywhere, up to rounding. Raises InputError for a device that is not there."""
+    seed gives the same frames everywhere, up to rounding. A wall that is `breathing` is another one in
+    each frame, which takes longer. Raises InputError for a device that is not there."""
     rng = np.random.default_rng(seed)
     config = config or TubeConfig()
     tube = kind(config, rng, light, rendering_device(device))
     mask = octagon(camera) if mask is None else mask
     poses = camera_path(tube.shape, count, travel, rng, config=config.path)
     at_once = max(1, _PIXELS_AT_ONCE[tube.device.type] // mask.size)
+    moving = None
+    if breathing is not None and breathing.amplitude > 0:
+        moving, at_once = Breathing(tube.shape, breathing), 1
     frames: list[Frame] = []
     for first in range(0, count, at_once):
         batch = poses[first : first + at_once]
-        for pose, view in zip(batch, tube.views(batch, camera, mask, rng), strict=True):
+        seen = tube if moving is None else tube.reshaped(moving.shape_at(first / 30.0))
+        for pose, view in zip(batch, seen.views(batch, camera, mask, rng), strict=True):
             frames.append(
                 Frame(
                     f"{len(frames):06d}",
@@ -65,7 +73,7 @@ def render_sequence(
             )
             if progress is not None:
                 progress(len(frames), count)
-    return TubeSequence(frames, tube)
+    return TubeSequence(frames, tube, moving)
 
 
 def tube_frames(

@@ -115,14 +115,24 @@ def swept(
     radius: np.ndarray, centers: np.ndarray, frames: np.ndarray, step: float, polyps: tuple[Polyp, ...] = ()
 ) -> TubeShape:
     """The shape of a wall at radius (R, C) [mm] from a centreline: centers (R, 3), frames (R, 3, 3)."""
-    phi = np.arange(radius.shape[1]) * 2 * np.pi / radius.shape[1]
-    side = np.cos(phi)[:, None] * frames[:, None, 1] + np.sin(phi)[:, None] * frames[:, None, 2]
+    side = _outwards(frames, radius.shape[1])
     vertices = centers[:, None] + radius[..., None] * side
     normals = _normals(vertices, side)
     if polyps:
         vertices = raised(vertices, normals, polyps)
         normals = _normals(vertices, side)
     return TubeShape(centers, frames, vertices, normals, radius.mean(1), step, polyps)
+
+
+def wall_normals(vertices: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Unit normals (R, C, 3), into the lumen, of a wall around a centreline with frames (R, 3, 3)."""
+    return _normals(vertices, _outwards(frames, vertices.shape[1]))
+
+
+def _outwards(frames: np.ndarray, spokes: int) -> np.ndarray:
+    phi = np.arange(spokes) * 2 * np.pi / spokes
+    result: np.ndarray = np.cos(phi)[:, None] * frames[:, None, 1] + np.sin(phi)[:, None] * frames[:, None, 2]
+    return result
 
 
 def closed(relative: np.ndarray, end: float, s: np.ndarray, length: float) -> np.ndarray:

@@ -1,5 +1,9 @@
 """A monocular SLAM's view of a synthetic colon: submaps with noise and known wrong points.
 
+Two kinds. "tracked" errs as stella_vslam does on such colons (lightdepth.tube.tracked): a keyframe every 10 to 20
+frames, short tracks, errors that neighbours share, few wrong points, a scale that drifts. "independent" is a stress
+test that no SLAM is: thousands of observations a keyframe, each point wrong on its own, three in ten altogether.
+
 Notation: a submap's frame is related to the world [mm] by X_map = scale · R X_world + t. Distances in mm unless "map".
 """
 
@@ -7,33 +11,55 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
+from lightdepth.tube.breathing import Breathing
+from lightdepth.tube.map_errors import scale_drift
+from lightdepth.tube.observed import points_at_corners, projected, sees, true_pose
+from lightdepth.tube.tracked import at, distance_factors, tracks, wrong_factors
+
+Kind = Literal["tracked", "independent"]
 
 
 @dataclass(frozen=True)
 class SlamConfig:
-    """How good the simulated SLAM is."""
+    """How good the simulated SLAM is; what is left out depends on its kind."""
 
-    keyframe_every: int = 2
-    """Number of frames from one keyframe to the next. More make fewer keyframes."""
+    kind: Kind = "tracked"
+    """Which SLAM is simulated: tracked, whose errors are those of a real one, or independent, a stress test with many
+    points, each wrong on its own."""
+    keyframe_every: int | None = None
+    """Number of frames from one keyframe to the next; left out, 10 to 20, drawn (tracked), or 2 (independent). More
+    make fewer keyframes."""
     maps: int = 2
     """Number of submaps that the keyframes are divided among. More make shorter submaps."""
     shared_keyframes: int = 2
     """Number of keyframes that a submap shares with the one before it. More make submaps easier to join."""
-    points_per_keyframe: int = 250
-    """Largest number of points that each keyframe makes anew. More make a denser map."""
-    spurious: float = 0.3
-    """Share of the map points that are wrong. A larger one makes the map harder to densify."""
-    point_noise: float = 0.01
-    """Deviation of a point's distance, as a share of it, at 20 mm; it grows in proportion to the distance (error ~
-    distance²). A larger one makes a noisier map."""
+    points_per_keyframe: int | None = None
+    """Largest number of points that each keyframe observes (tracked; left out, 250 to 1500, drawn for each submap) or
+    makes anew (independent; left out, 250). More make a denser map."""
+    spurious: float | None = None
+    """Share of the map points that are wrong; left out, 0.03 (tracked) or 0.3 (independent). A larger one makes the
+    map harder to densify."""
+    point_noise: float | None = None
+    """Error of a point's distance, as a share of it; left out, 0.035 (tracked: the median of its size) or 0.01
+    (independent: the deviation at 20 mm; it grows in proportion to the distance, so the error with its square). A
+    larger one makes a noisier map."""
+    shared_noise: float = 0.3
+    """Share of the variance of that error that neighbouring points have in common, of tracked ones. A larger one
+    makes whole pieces of wall wrong together."""
+    shared_length_mm: float = 6.0
+    """Distance within which points are neighbours in that sense, mm: they share exp(-1/2) of it. A larger one makes
+    larger pieces."""
+    drift: float | None = None
+    """Change of a submap's scale along its path, as a share, growing or shrinking; left out, 0.04 (tracked) or 0
+    (independent). A larger one makes one end of the map larger than the other."""
     pixel_noise: float = 0.5
     """Deviation of where a point is observed in the image along each axis, pixels. A larger one makes noisier
     observations."""
@@ -43,32 +69,81 @@ class SlamConfig:
     """Deviation of a keyframe's rotation about each axis, degrees. A larger one makes noisier poses."""
 
 
+class _Settings(NamedTuple):
+    """What a kind takes for what is left out; None is drawn."""
+
+    keyframe_every: int | None
+    points: int | None
+    spurious: float
+    point_noise: float
+    drift: float
+
+    @classmethod
+    def of(cls, config: SlamConfig) -> _Settings:
+        usual = _USUAL[config.kind]
+        return cls(
+            usual.keyframe_every if config.keyframe_every is None else config.keyframe_every,
+            usual.points if config.points_per_keyframe is None else config.points_per_keyframe,
+            usual.spurious if config.spurious is None else config.spurious,
+            usual.point_noise if config.point_noise is None else config.point_noise,
+            usual.drift if config.drift is None else config.drift,
+        )
+
+
+_USUAL: dict[Kind, _Settings] = {
+    "tracked": _Settings(None, None, 0.03, 0.035, 0.04),
+    "independent": _Settings(2, 250, 0.3, 0.01, 0.0),
+}
+_GAPS, _POINTS = (10, 20), (250, 1500)
+
+
 @dataclass(frozen=True)
 class SimulatedSlam:
     """The map, and what only the simulation knows: map_from_world (scale, rotation (3, 3), translation (3,)) and the
-    ids of the wrong points, both by submap id."""
+    ids of the wrong points, both by submap id. Where scale drifts, map_from_world has that of the path's middle."""
 
     map: SparseMap
     map_from_world: dict[int, tuple[float, np.ndarray, np.ndarray]]
     spurious_ids: dict[int, np.ndarray]
 
 
-def simulate_slam(frames: Sequence[Frame], config: SlamConfig, seed: int) -> SimulatedSlam:
+def simulate_slam(
+    frames: Sequence[Frame], config: SlamConfig, seed: int, breathing: Breathing | None = None
+) -> SimulatedSlam:
     """Keyframes of frames with truth, corners as points, and each submap in a frame and scale of its own.
 
-    A wrong point is moved along the ray of the keyframe that made it, by a factor of 1.3 + Exp(4).
+    A wrong point is moved along the ray of the keyframe that made it, by a factor of 1.3 + Exp(4) (independent), or of
+    the mean ray of those that observed it, by one beyond 1.3 either way (tracked). A wall that is `breathing` carries
+    its points along, and the map has them where they were in the mean of the keyframes that observed them; an
+    independent SLAM knows no such wall.
     """
+    if breathing is not None and config.kind == "independent":
+        raise InputError("--breathing.amplitude", "an independent SLAM", "expected --slam.kind tracked")
+    settings = _Settings.of(config)
     rng = np.random.default_rng([seed, 1])
-    keyframes = list(frames)[:: config.keyframe_every]
+    keyframes = _keyframes(frames, settings.keyframe_every, rng)
     if len(keyframes) < 2 * config.maps:
         raise InputError(
-            f"{config.maps} maps", f"{len(keyframes)} keyframes cannot be shared among them", "render more frames"
+            f"{config.maps} maps",
+            f"{len(keyframes)} keyframes cannot be shared among them",
+            "render more frames, or make more of them keyframes (--slam.keyframe_every)",
         )
     submaps, sims, wrong = [], {}, {}
     for map_id, part in enumerate(_parts(len(keyframes), config.maps, config.shared_keyframes)):
-        submap, sims[map_id], wrong[map_id] = _submap(map_id, [keyframes[i] for i in part], config, rng)
+        chosen = [keyframes[i] for i in part]
+        submap, sims[map_id], wrong[map_id] = _submap(map_id, chosen, config, settings, rng, breathing)
+        if settings.drift > 0:
+            submap, sims[map_id] = _drifting(submap, chosen, sims[map_id], settings.drift, rng)
         submaps.append(submap)
     return SimulatedSlam(SparseMap(tuple(submaps), "simulated SLAM"), sims, wrong)
+
+
+def _keyframes(frames: Sequence[Frame], every: int | None, rng: np.random.Generator) -> list[Frame]:
+    if every is not None:
+        return list(frames)[::every]
+    (own,) = rng.spawn(1)
+    places = np.cumsum([0, *own.integers(*_GAPS, len(frames) // _GAPS[0], endpoint=True)])
+    return [frames[i] for i in places if i < len(frames)]
 
 
 def _parts(count: int, maps: int, shared: int) -> list[range]:
@@ -76,32 +151,24 @@ def _parts(count: int, maps: int, shared: int) -> list[range]:
     return [range(max(0, a - (shared if a else 0)), b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
-def _submap(
-    map_id: int, frames: list[Frame], config: SlamConfig, rng: np.random.Generator
-) -> tuple[Submap, tuple[float, np.ndarray, np.ndarray], np.ndarray]:
-    points, origins = [], []
-    for index, frame in enumerate(frames):
-        found = _new_points(frame, config.points_per_keyframe, rng)
-        points.append(found)
-        origins.append(np.full(len(found), index))
-    world, made_by = np.concatenate(points), np.concatenate(origins)
-    seen = np.stack([_sees(frame, world) for frame in frames])  # (frames, points)
-    seen &= rng.random(seen.shape) < 0.85
-    seen[made_by, np.arange(len(world))] = True
-    keep = seen.sum(0) >= min(3, len(frames))
-    world, made_by, seen = world[keep], made_by[keep], seen[:, keep]
-    if not len(world):
-        raise InputError(
-            "the simulated map", "no point is seen by enough keyframes", "use a shorter travel or more frames"
-        )
+_Similarity = tuple[float, np.ndarray, np.ndarray]
 
-    pixels = [_project(frame, world) + rng.normal(0, config.pixel_noise, (len(world), 2)) for frame in frames]
-    centers = np.stack([_pose(frame)[:3, 3] for frame in frames])[made_by]
-    distance = np.linalg.norm(world - centers, axis=1)
-    factor = 1 + config.point_noise * distance / 20 * rng.standard_normal(len(world))
-    wrong = rng.random(len(world)) < config.spurious
-    factor[wrong] = 1.3 + rng.exponential(4, int(wrong.sum()))
-    noisy = centers + np.clip(factor, 0.2, None)[:, None] * (world - centers)
+
+def _submap(
+    map_id: int,
+    frames: list[Frame],
+    config: SlamConfig,
+    settings: _Settings,
+    rng: np.random.Generator,
+    breathing: Breathing | None,
+) -> tuple[Submap, _Similarity, np.ndarray]:
+    """The submap, map_from_world, and the ids of its wrong points."""
+    if config.kind == "tracked":
+        observed = _tracked(frames, config, settings, rng, breathing)
+    else:
+        observed = _independent(frames, config, settings, rng)
+    world, seen, origin, factor, pixels, wrong = observed
+    noisy = origin + factor[:, None] * (world - origin)
 
     scale = float(np.exp(rng.uniform(np.log(0.02), np.log(0.5))))
     rotation = Rotation.random(rng=rng).as_matrix()
@@ -109,7 +176,7 @@ def _submap(
     ids = np.arange(len(world))
     keyframes = []
     for frame, row, pixel in zip(frames, seen, pixels, strict=True):
-        world_from_cam = _pose(frame).copy()
+        world_from_cam = true_pose(frame).copy()
         turn = Rotation.from_rotvec(np.deg2rad(config.pose_noise_deg) * rng.standard_normal(3)).as_matrix()
         world_from_cam[:3, :3] = world_from_cam[:3, :3] @ turn
         world_from_cam[:3, 3] += config.pose_noise_mm * rng.standard_normal(3)
@@ -122,45 +189,81 @@ def _submap(
     return Submap(map_id, tuple(keyframes), ids, in_map), (scale, rotation, translation), ids[wrong]
 
 
-def _pose(frame: Frame) -> np.ndarray:
-    if frame.true_world_from_cam is None or frame.true_distance is None:
+class _Observed(NamedTuple):
+    """True points (n, 3), who observed them (frames, n), the centres (n, 3) from which their distance is wrong by a
+    factor (n,), pixels (n, 2) for each frame, and which are wrong points (n,)."""
+
+    world: np.ndarray
+    seen: np.ndarray
+    origin: np.ndarray
+    factor: np.ndarray
+    pixels: list[np.ndarray]
+    wrong: np.ndarray
+
+
+def _tracked(
+    frames: list[Frame],
+    config: SlamConfig,
+    settings: _Settings,
+    rng: np.random.Generator,
+    breathing: Breathing | None,
+) -> _Observed:
+    count = settings.points or round(float(np.exp(rng.uniform(*np.log(_POINTS)))))
+    rest, seen = tracks(frames, count, rng, breathing)
+    _check_points(rest)
+    there = [at(frame, rest, breathing) for frame in frames]
+    pixels = [
+        projected(f, p) + rng.normal(0, config.pixel_noise, (len(rest), 2)) for f, p in zip(frames, there, strict=True)
+    ]
+    world = rest if breathing is None else (seen[..., None] * np.stack(there)).sum(0) / seen.sum(0)[:, None]
+    centers = np.stack([true_pose(frame)[:3, 3] for frame in frames])
+    origin = (seen.T / seen.sum(0)[:, None]) @ centers
+    factor = distance_factors(
+        frames, world, seen, settings.point_noise, config.shared_noise, config.shared_length_mm, rng
+    )
+    wrong = rng.random(len(world)) < settings.spurious
+    factor[wrong] = wrong_factors(int(wrong.sum()), rng)
+    return _Observed(world, seen, origin, factor, pixels, wrong)
+
+
+def _independent(frames: list[Frame], config: SlamConfig, settings: _Settings, rng: np.random.Generator) -> _Observed:
+    points, origins = [], []
+    assert settings.points is not None
+    for index, frame in enumerate(frames):
+        found = points_at_corners(frame, settings.points)
+        points.append(found)
+        origins.append(np.full(len(found), index))
+    world, made_by = np.concatenate(points), np.concatenate(origins)
+    seen = np.stack([sees(frame, world) for frame in frames])  # (frames, points)
+    seen &= rng.random(seen.shape) < 0.85
+    seen[made_by, np.arange(len(world))] = True
+    keep = seen.sum(0) >= min(3, len(frames))
+    world, made_by, seen = world[keep], made_by[keep], seen[:, keep]
+    _check_points(world)
+
+    pixels = [projected(frame, world) + rng.normal(0, config.pixel_noise, (len(world), 2)) for frame in frames]
+    origin = np.stack([true_pose(frame)[:3, 3] for frame in frames])[made_by]
+    distance = np.linalg.norm(world - origin, axis=1)
+    factor = 1 + settings.point_noise * distance / 20 * rng.standard_normal(len(world))
+    wrong = rng.random(len(world)) < settings.spurious
+    factor[wrong] = 1.3 + rng.exponential(4, int(wrong.sum()))
+    return _Observed(world, seen, origin, np.clip(factor, 0.2, None), pixels, wrong)
+
+
+def _check_points(world: np.ndarray) -> None:
+    if not len(world):
         raise InputError(
-            frame.name, "no true distance or no true pose", "a SLAM can only be simulated on frames with both"
+            "the simulated map", "no point is seen by enough keyframes", "use a shorter travel or more frames"
         )
-    return frame.true_world_from_cam
 
 
-def _new_points(frame: Frame, count: int, rng: np.random.Generator) -> np.ndarray:
-    """World points (n, 3) at corners of the image, where the wall is known."""
-    pose, truth = _pose(frame), frame.true_distance
-    assert truth is not None
-    usable = cv2.erode((frame.valid & (truth > 0)).astype(np.uint8), np.ones((7, 7), np.uint8))
-    grey = cv2.cvtColor((frame.image * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
-    corners = cv2.goodFeaturesToTrack(grey, count, 0.001, 3, mask=usable)
-    if corners is None:
-        return np.zeros((0, 3))
-    pixels = corners.reshape(-1, 2) + 0.5
-    column, row = pixels.astype(int).T
-    rays, valid = frame.camera.unproject(np.stack([column, row], -1) + 0.5)
-    points = rays * truth[row, column, None]
-    result: np.ndarray = (points @ pose[:3, :3].T + pose[:3, 3])[valid]
-    return result
-
-
-def _project(frame: Frame, world: np.ndarray) -> np.ndarray:
-    pose = _pose(frame)
-    result: np.ndarray = frame.camera.project((world - pose[:3, 3]) @ pose[:3, :3])[0]
-    return result
-
-
-def _sees(frame: Frame, world: np.ndarray) -> np.ndarray:
-    """(n,) bool: in the image, inside the mask, and not behind the wall."""
-    pose, truth = _pose(frame), frame.true_distance
-    assert truth is not None
-    in_cam = (world - pose[:3, 3]) @ pose[:3, :3]
-    pixels, valid = frame.camera.project(in_cam)
-    column = np.clip(pixels[:, 0].astype(int), 0, frame.camera.width - 1)
-    row = np.clip(pixels[:, 1].astype(int), 0, frame.camera.height - 1)
-    at_wall = np.abs(truth[row, column] / np.linalg.norm(in_cam, axis=1).clip(min=1e-9) - 1) < 0.03
-    result: np.ndarray = valid & frame.valid[row, column] & at_wall
-    return result
+def _drifting(
+    submap: Submap, frames: list[Frame], true: _Similarity, size: float, rng: np.random.Generator
+) -> tuple[Submap, _Similarity]:
+    """The scale grows or shrinks by `size` along the path; map_from_world is that of its middle."""
+    start = float((1 + size) ** rng.choice([-1, 1]))
+    drifted = scale_drift(submap, start)
+    scale, rotation = true[0] * np.sqrt(start), true[1]
+    middle = np.mean([k.center for k in drifted.keyframes], axis=0)
+    translation = middle - scale * rotation @ np.mean([true_pose(frame)[:3, 3] for frame in frames], axis=0)
+    return drifted, (float(scale), rotation, translation)

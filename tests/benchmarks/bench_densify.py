@@ -73,7 +73,8 @@ class Scene:
 
     def slam(self, seed: int, points: int = 250) -> SimulatedSlam:
         """With so many new points for each keyframe."""
-        return simulate_slam(self.frames, SlamConfig(maps=1, spurious=0.3, points_per_keyframe=points), seed)
+        config = SlamConfig("independent", maps=1, spurious=0.3, points_per_keyframe=points)
+        return simulate_slam(self.frames, config, seed)
 
     def densified(
         self, slam: SimulatedSlam, model: Callable[[Frame], DepthPrediction], config: DensifyConfig

@@ -89,7 +89,8 @@ def test_a_keyframe_is_on_the_surface_in_200_ms(seed):
     """Row 6: 320x256, the bundled checkpoint, 500 points per keyframe, 30 % of them wrong; a rendered colon."""
     torch.set_num_threads(1)  # two that wait for each other on a busy machine take thirty times as long
     sequence = render_sequence(seed, 24, lens("c3vd", 320, 256), 24.0)
-    found = simulate_slam(sequence.frames, SlamConfig(keyframe_every=1, maps=1, points_per_keyframe=30), seed)
+    config = SlamConfig("independent", keyframe_every=1, maps=1, points_per_keyframe=30)
+    found = simulate_slam(sequence.frames, config, seed)
     frames = FrameSequence([f.name for f in sequence.frames], sequence.frames.__getitem__, "rendered")
     played = play(frames, found.map, load_model(DEFAULT_CHECKPOINT, details=False), LIVE, lambda _: None)
     figures = time_spent(played, 0.2).record()

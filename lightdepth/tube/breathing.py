@@ -1,0 +1,77 @@
+"""A colon whose wall moves: it breathes as a whole, or waves run along it. Truth is then each frame's own.
+
+Notation: s the arc length along the centreline [mm], t the time [s], c(s) the centreline. The wall at rest, c + v, is
+at c + f(s, t) v, with f = 1 + a sin 2 pi (t / T - s / L): amplitude a, period T, wavelength L. The centreline rests,
+and so does the path of the endoscope.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lightdepth.errors import InputError
+from lightdepth.tube.shape import TubeShape, wall_normals
+
+
+@dataclass(frozen=True)
+class BreathingConfig:
+    """How the wall of a colon moves."""
+
+    amplitude: float = 0.0
+    """Largest change of the colon's radius, as a share of it; 0 keeps the wall still. A larger one moves it more."""
+    period: float = 4.0
+    """Time from one breath or wave to the next, seconds. A longer one moves the wall more slowly."""
+    wavelength_mm: float = 0.0
+    """Distance from one wave to the next along the colon (peristalsis), mm; 0 lets the whole colon breathe at once. A
+    larger one makes longer waves."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.amplitude <= 0.3:
+            raise InputError("breathing.amplitude", f"{self.amplitude}", "expected a share from 0 to 0.3")
+        if not self.period > 0 or not 0 <= self.wavelength_mm < np.inf:
+            raise InputError(
+                "breathing",
+                f"period {self.period}, wavelength_mm {self.wavelength_mm}",
+                "expected a period above 0 and a wavelength of at least 0",
+            )
+
+
+class Breathing:
+    """The motion of one colon's wall."""
+
+    def __init__(self, shape: TubeShape, config: BreathingConfig):
+        self._shape, self._config = shape, config
+        self._rings = cKDTree(shape.centers)
+
+    def factor(self, s: np.ndarray, time: float) -> np.ndarray:
+        """f at places s (n,)."""
+        config = self._config
+        phase = time / config.period - (s / config.wavelength_mm if config.wavelength_mm else 0 * s)
+        result: np.ndarray = 1 + config.amplitude * np.sin(2 * np.pi * phase)
+        return result
+
+    def shape_at(self, time: float) -> TubeShape:
+        """The colon at a time."""
+        rest = self._shape
+        f = self.factor(np.arange(len(rest.centers)) * rest.step, time)
+        vertices = rest.centers[:, None] + f[:, None, None] * (rest.vertices - rest.centers[:, None])
+        return replace(rest, vertices=vertices, normals=wall_normals(vertices, rest.frames), radius=rest.radius * f)
+
+    def at(self, rest: np.ndarray, time: float) -> np.ndarray:
+        """Where points of the wall, (n, 3) at rest, are at a time."""
+        center, f = self._around(rest, time)
+        result: np.ndarray = center + f * (rest - center)
+        return result
+
+    def at_rest(self, points: np.ndarray, time: float) -> np.ndarray:
+        """Where points of the wall, (n, 3) at a time, are at rest."""
+        center, f = self._around(points, time)
+        result: np.ndarray = center + (points - center) / f
+        return result
+
+    def _around(self, points: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
+        row = self._rings.query(points)[1]
+        return self._shape.centers[row], self.factor(row * self._shape.step, time)[:, None]
