@@ -17,7 +17,7 @@ from lightdepth.light.fit_on_map import fit_assumed_light, with_light
 from lightdepth.maps import read_map
 from lightdepth.models import ConstantModel, DepthModel
 from lightdepth.reporting.report import number
-from lightdepth.reporting.run import Run
+from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.reconstruction import sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
@@ -64,6 +64,9 @@ def made_sparse(
     for submap in found.submaps:
         errors = number(float(np.median(submap.reprojection_errors())))
         run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
+    if found.poses is not None:
+        run.log(f"known poses: {found.poses}")
+        run.record["known_poses"] = plain(found.poses)
     if found.failed:
         reasons = summary(list(found.failed.values()))
         run.log(f"{len(found.failed)} of {len(frames)} frames found no place: {reasons}")

@@ -12,7 +12,7 @@ from colons import colon, sequence, slam
 from raising import refused
 from scenes import C3VD, cylinder, ray_tensors, slanted_plane
 
-from lightdepth.calibration import read_light
+from lightdepth.calibration import read_light, write_light
 from lightdepth.cli import main
 from lightdepth.datasets import FrameSequence, open_sequence, write_folder
 from lightdepth.frame import Frame
@@ -185,17 +185,29 @@ def test_densify_fits_the_light_that_nobody_gave_unless_told_not_to(data, tmp_pa
         assert "Light fitted on the map" in (tmp_path / "run" / "report.html").read_text()
 
 
-@pytest.mark.parametrize("given", ["option", "file"])
+@pytest.mark.parametrize("given", ["option", "file", "file with the default numbers"])
 def test_densify_keeps_a_light_that_somebody_gave(data, tmp_path, given):
     folder = tmp_path / "seq"
     shutil.copytree(data, folder)
     argv = ["densify", str(folder), "--map", str(folder / "slam"), "--checkpoint", "decline", "--withhold", "0"]
-    if given == "file":
-        (folder / "light.json").write_text('{"gamma": 2.0, "mu": 1.0}')
+    if given != "option":
+        numbers = {} if given == "file with the default numbers" else {"gamma": 2.0, "mu": 1.0}
+        (folder / "light.json").write_text(json.dumps({"gamma": 2.2, "mu": 2.767} | numbers))
     else:
         argv += ["--light", "gamma=2.2,mu=2.767"]
     assert main([*argv, "-o", str(tmp_path / "run")]) == 0
     assert "light_fit" not in json.loads((tmp_path / "run" / "run.json").read_text())
+
+
+def test_nobody_gave_a_light_that_its_source_calls_assumed_whatever_its_numbers_are(tmp_path):
+    assert PhotometricCalibration(gamma=1.0).assumed and not PhotometricCalibration(source="given").assumed
+    write_light(PhotometricCalibration(gamma=1.0), tmp_path / "light.json")
+    assert read_light(tmp_path / "light.json").assumed
+    assert read_light("gamma=2.2,mu=2.767").source == "given"
+    frames = sequence([Frame("0", np.zeros((96, 120, 3), np.float32), CAMERA)])
+    write_folder(frames, tmp_path / "seq")
+    assert open_sequence(tmp_path / "seq")[0].light.assumed
+    assert not open_sequence(tmp_path / "seq", light=tmp_path / "seq" / "light.json")[0].light.assumed
 
 
 def test_the_verb_refuses_a_folder_as_its_file(data, tmp_path, capsys):

@@ -15,10 +15,11 @@ from raising import refused
 from lightdepth.calibration import write_light
 from lightdepth.camera import KannalaBrandt, Pinhole
 from lightdepth.datasets import open_sequence, write_folder
-from lightdepth.datasets.checks import AS_GIVEN, check_sequence, comb_ratio, fitting_reading
+from lightdepth.datasets.checks import check_sequence, comb_ratio, fitting_reading
 from lightdepth.files.images import read_image
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.pose_readings import AS_GIVEN
 from lightdepth.tube import lens
 
 LENS = lens("c3vd", 100, 80)

@@ -72,6 +72,7 @@ def densify(
         work = Densified.make(frames, sparse_map, model, config, merging if merge else None)
         work.write(run, formats, mm_per_unit)
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
+        notes += [f"Warning: {said}" for said in run.record["warnings"]]
         page = densify_page("Densified maps", work.results, work.baselines, work.gallery, notes, None, mm_per_unit)
         if work.merged is not None:
             joined_section(page, work.merged)

@@ -23,6 +23,7 @@ from lightdepth.datasets.sequence import FrameSequence, border_mask
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.pose_readings import AS_GIVEN, INVERSE, POSE_READINGS, as_is
 from lightdepth.sparse_map import check_rigid
 
 _SAMPLES = 600  # pixels of a frame whose points are looked for in another
@@ -204,27 +205,6 @@ def _scaled(factor: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
-def _transposed(pose: np.ndarray) -> np.ndarray:
-    pose = pose.copy()
-    pose[:3, :3] = pose[:3, :3].T
-    return pose
-
-
-def _opengl(pose: np.ndarray) -> np.ndarray:
-    return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def _left_handed(pose: np.ndarray) -> np.ndarray:
-    flip = np.diag([1.0, -1.0, 1.0, 1.0])
-    result: np.ndarray = flip @ pose @ flip
-    return result
-
-
-def _as_is(pose: np.ndarray) -> np.ndarray:
-    return pose
-
-
-AS_GIVEN = "as given"
 _UNITS = {
     1000.0: "multiplied by 1000: they are in metres, the distances in millimetres",
     100.0: "multiplied by 100",
@@ -233,20 +213,13 @@ _UNITS = {
     0.01: "divided by 100",
     0.001: "divided by 1000: they are in millimetres, the distances in metres",
 }
-INVERSE = "with the poses inverted: they are camera-from-world (w2c), expected is world-from-camera (c2w)"
 READINGS: dict[str, Reading] = {
-    AS_GIVEN: Reading(_as_is, _same),
-    INVERSE: Reading(np.linalg.inv, _same),
-    "with the rotations transposed: they are written column by column": Reading(_transposed, _same),
-    "with the camera's y and z axes turned: they are OpenGL's (y up, z backwards), expected is y down, z forward": (
-        Reading(_opengl, _same)
-    ),
-    "with y mirrored: the poses are in left-handed axes, as Unity's": Reading(_left_handed, _same),
+    **{name: Reading(meant, _same) for name, meant in POSE_READINGS.items()},
     "with the truth taken as depth along the axis and divided by the ray's z; expected is distance along the ray": (
-        Reading(_as_is, lambda depth, ray_z: depth / ray_z)
+        Reading(as_is, lambda depth, ray_z: depth / ray_z)
     ),
     "with the truth multiplied by the ray's z: depth was taken for distance once too often": (
-        Reading(_as_is, lambda distance, ray_z: distance * ray_z)
+        Reading(as_is, lambda distance, ray_z: distance * ray_z)
     ),
     **{f"with the translations {text}": Reading(_scaled(factor), _same) for factor, text in _UNITS.items()},
     **{

@@ -209,7 +209,7 @@ def fit_assumed_light(
 
     What was fitted goes into the run's record as `light_fit`, and why nothing was into its log.
     """
-    if frames[0].light != PhotometricCalibration():
+    if not frames[0].light.assumed:
         return None
     start = time.perf_counter()
     try:
