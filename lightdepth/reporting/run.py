@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.writing import move_whole, write_whole
@@ -79,8 +79,15 @@ class Run:
         """What is warned of meanwhile, by whom ever, is in log.txt and run.json too."""
         shown = warnings.showwarning
 
-        def heard(message: Warning | str, category: type[Warning], *where: Any, **rest: Any) -> None:
-            shown(message, category, *where, **rest)
+        def heard(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            shown(message, category, filename, lineno, file, line)
             if issubclass(category, UserWarning):  # a library's deprecations are no news to a user
                 self.record["warnings"].append(str(message))
                 self._note(f"warning: {message}")
