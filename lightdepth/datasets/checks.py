@@ -13,7 +13,7 @@ and the file's own does not.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +28,10 @@ from lightdepth.sparse_map import check_rigid
 
 _SAMPLES = 600  # pixels of a frame whose points are looked for in another
 _FITS, _BETTER = 0.05, 0.3  # a reading explains the data: median error below the first, and this share of the file's
+CONTRADICTION = 0.02
+"""Median difference of the distances of one point seen from two frames, from which poses and truth contradict."""
+_PLAUSIBLE_MM = 1.0, 1000.0  # median distance of the wall from an endoscope
+_LEAST_KNOWN = 100  # pixels of known distance from which their values say something
 _GOOD = 0.005  # below this median error nothing else is tried
 _LEAST_SEEN = 0.1  # share of the points that have to fall on known distance
 _COMBED = 1.3  # comb ratio from which an image looks interlaced; real progressive endoscopy: 1.01 to 1.22
@@ -39,12 +43,7 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
     Raises InputError where poses and truth contradict each other and another reading fits; warns of what is unlikely.
     A frame that cannot be read is left out: it is refused when it is asked for.
     """
-    frames = []
-    for i in sequence.sampled:
-        try:
-            frames.append(sequence[i])
-        except InputError:
-            continue
+    frames = _readable(sequence, sequence.sampled)
     if not frames:
         return sequence
     for message in (
@@ -52,13 +51,17 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
         *_light_doubts(frames[0].light),
         *_mask_doubts(frames),
         *_truth_doubts(frames),
+        *_unit_doubts(frames),
+        *_level_doubts(frames),
         *_comb_doubts(frames),
     ):
         warnings.warn(f"{sequence.source}: {message}", stacklevel=3)
     for frame in frames:
         if frame.true_world_from_cam is not None:
             check_rigid(frame.true_world_from_cam, f"{sequence.source}: {frame.name}")
-    fit = fitting_reading(frames)
+    fit = _fit_of(sequence, frames)
+    if fit is not None and fit.best == AS_GIVEN and fit.error_as_given > CONTRADICTION:
+        warnings.warn(f"{sequence.source}: {_contradiction(fit)}", stacklevel=3)
     if fit is not None and fit.best != AS_GIVEN:
         raise InputError(
             sequence.source,
@@ -67,6 +70,26 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
             f"they agree to {fit.error:.1%} {fit.best}",
         )
     return sequence
+
+
+def unusable_truth(sequence: FrameSequence) -> list[str]:
+    """Why nothing can be judged by the truth of a sequence: it contradicts its poses, or is not in millimetres."""
+    frames = _readable(sequence, sequence.sampled)
+    fit = _fit_of(sequence, frames) if frames else None
+    return [
+        *_unit_doubts(frames),
+        *([_contradiction(fit)] if fit is not None and fit.error_as_given > CONTRADICTION else []),
+    ]
+
+
+def _readable(sequence: FrameSequence, rows: Iterable[int]) -> list[Frame]:
+    frames = []
+    for i in rows:
+        try:
+            frames.append(sequence[i])
+        except InputError:
+            continue
+    return frames
 
 
 # ---- camera, light, mask, image
@@ -136,6 +159,40 @@ def _truth_doubts(frames: Sequence[Frame]) -> list[str]:
     if all(len(values) == 0 or np.ptp(values) == 0 for values in known):
         return [f"the true distance is the same number everywhere in {names}: is it a depth map?"]
     return []
+
+
+def _known_distances(frames: Sequence[Frame]) -> np.ndarray:
+    """All true distances (n,) of the frames that are known."""
+    truths = [frame.true_distance for frame in frames if frame.true_distance is not None]
+    return np.concatenate([np.zeros(0), *(truth[np.isfinite(truth) & (truth > 0)] for truth in truths)])
+
+
+def _unit_doubts(frames: Sequence[Frame]) -> list[str]:
+    known = _known_distances(frames)
+    if len(known) < _LEAST_KNOWN or np.ptp(known) == 0:
+        return []
+    middle = float(np.median(known))
+    if not _PLAUSIBLE_MM[0] <= middle <= _PLAUSIBLE_MM[1]:
+        return [
+            f"the true distance would be {middle:.3g} mm (median): is it in metres, or a code? Expected are millimetres"
+        ]
+    if known.max() <= 255 and (known == np.rint(known)).all():
+        return [
+            f"the true distance holds whole numbers from {known.min():.0f} to {known.max():.0f} alone, as codes of 8 "
+            "bits do: is it in millimetres, and finer?"
+        ]
+    return []
+
+
+def _level_doubts(frames: Sequence[Frame]) -> list[str]:
+    known = _known_distances(frames)
+    levels = np.unique(known)
+    if len(known) < _LEAST_KNOWN or not 2 < len(levels) <= 256 or _unit_doubts(frames):
+        return []
+    return [
+        f"the true distance has only {len(levels)} different values, {np.median(np.diff(levels)):.2g} mm apart, as if "
+        "coded in 8 bits: smaller errors cannot be told"
+    ]
 
 
 def _comb_doubts(frames: Sequence[Frame]) -> list[str]:
@@ -233,6 +290,34 @@ READINGS: dict[str, Reading] = {
 """What poses and distances might mean, by how a message says it."""
 
 
+def _fit_of(sequence: FrameSequence, frames: Sequence[Frame]) -> Fit | None:
+    """How well the poses and truth of the frames fit; where these see no common wall, with those that follow them."""
+    both = [f for f in frames if f.true_world_from_cam is not None and len(_known_distances([f]))]
+    fit = fitting_reading(frames)
+    if fit is not None or len(both) < 2:
+        return fit
+    following = {i + 1 for i in sequence.sampled if i + 1 < len(sequence)} - set(sequence.sampled)
+    neighbours = [*frames, *_readable(sequence, sorted(following))]
+    fit = fitting_reading(neighbours)
+    numbers = sorted(f.number for f in neighbours if f.true_world_from_cam is not None)
+    if fit is None and 1 in np.diff(numbers):
+        return Fit(float("inf"), AS_GIVEN, float("inf"))
+    return fit
+
+
+def _contradiction(fit: Fit) -> str:
+    if not np.isfinite(fit.error_as_given):
+        return (
+            "poses and true distances contradict each other: by its poses no frame sees the wall that the next one "
+            "sees, and no reading of them that is known explains it"
+        )
+    return (
+        "poses and true distances contradict each other: distances seen from two frames differ by "
+        f"{fit.error_as_given:.1%} (median; at most {CONTRADICTION:.0%} is expected), and no reading of them that is "
+        "known explains it: is it the calibration of these images, and does the wall stand still?"
+    )
+
+
 def fitting_reading(frames: Sequence[Frame]) -> Fit | None:
     """Which of `READINGS` the frames' poses and true distances obey: the given one unless another is clearly better.
 
@@ -255,10 +340,11 @@ def fitting_reading(frames: Sequence[Frame]) -> Fit | None:
 def _error(frames: Sequence[Frame], reading: Reading) -> float:
     """Median over the pairs of frames that see the same surface, of their median relative errors; else infinity."""
     pairs = [(a, b) for i, a in enumerate(frames) for b in frames[i + 1 :]]
-    errors = [e for a, b in pairs for e in (_pair_error(a, b, reading),) if e is not None]
+    errors = [e for a, b in pairs if (e := _pair_error(a, b, reading)) is not None and np.isfinite(e)]
     return float(np.median(errors)) if errors else float("inf")
 
 
+@np.errstate(all="ignore")  # a reading may divide by a ray's z, and a lens may have none there
 def _pair_error(a: Frame, b: Frame, reading: Reading) -> float | None:
     """Median relative difference between where points of `a` should be from `b` and what is known there."""
     assert a.true_distance is not None and b.true_distance is not None
@@ -273,8 +359,8 @@ def _pair_error(a: Frame, b: Frame, reading: Reading) -> float | None:
     b_from_a = np.linalg.inv(reading.pose(b.true_world_from_cam)) @ reading.pose(a.true_world_from_cam)
     points = rays * distance[:, None] @ b_from_a[:3, :3].T + b_from_a[:3, 3]
     pixels, seen = b.camera.project(points)
-    u = np.clip(pixels[:, 0].astype(int), 0, b.camera.width - 1)
-    v = np.clip(pixels[:, 1].astype(int), 0, b.camera.height - 1)
+    seen &= np.isfinite(pixels).all(1) & np.isfinite(points).all(1)
+    u, v = np.where(seen[:, None], pixels, 0).clip(0, (b.camera.width - 1, b.camera.height - 1)).astype(int).T
     known = reading.distance(b.true_distance[v, u].astype(np.float64), b.camera.rays()[0][v, u, 2])
     seen &= b.valid[v, u] & np.isfinite(known) & (known > 0)
     if seen.sum() < max(20, _LEAST_SEEN * len(rows)):
