@@ -259,12 +259,16 @@ def test_densify_keeps_a_light_that_somebody_gave(data, tmp_path, given):
     shutil.copytree(data, folder)
     argv = ["densify", str(folder), "--map", str(folder / "slam"), "--checkpoint", "decline", "--withhold", "0"]
     if given != "option":
-        numbers = {} if given == "file with the default numbers" else {"gamma": 2.0, "mu": 1.0}
+        numbers = {} if given == "file with the default numbers" else {"gamma": 0.9, "mu": 1.0}
         (folder / "light.json").write_text(json.dumps({"gamma": 2.2, "mu": 2.767} | numbers))
     else:
         argv += ["--light", "gamma=2.2,mu=2.767"]
     assert main([*argv, "-o", str(tmp_path / "run")]) == 0
-    assert "light_fit" not in json.loads((tmp_path / "run" / "run.json").read_text())
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert "light_fit" not in record
+    told = [said for said in record["warnings"] if "gamma is 0.9; a camera's is between 1 and 3" in said]
+    assert len(told) == (given == "file")
+    assert ("Warning: " in (tmp_path / "run" / "report.html").read_text()) is (given == "file")
 
 
 def test_nobody_gave_a_light_that_its_source_calls_assumed_whatever_its_numbers_are(tmp_path):

@@ -171,7 +171,7 @@ def poses_of_three_places(made: list[Frame]) -> list[np.ndarray]:
 @pytest.mark.parametrize(
     "change, said",
     [
-        (lambda d: d / 255, r"would be 0\.\d+ mm \(median\): is it in metres, or a code"),
+        (lambda d: d / 255, r"would be 0\.\d+ mm \(median\): it may be in metres, or a code"),
         (lambda d: np.rint(d * 255 / d.max()), "whole numbers from .* alone, as codes of 8 bits do"),
         (lambda d: np.rint(d * 655), r"would be \d+.* mm \(median\)"),
     ],

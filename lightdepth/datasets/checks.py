@@ -174,12 +174,13 @@ def _unit_doubts(frames: Sequence[Frame]) -> list[str]:
     middle = float(np.median(known))
     if not _PLAUSIBLE_MM[0] <= middle <= _PLAUSIBLE_MM[1]:
         return [
-            f"the true distance would be {middle:.3g} mm (median): is it in metres, or a code? Expected are millimetres"
+            f"the true distance would be {middle:.3g} mm (median): it may be in metres, or a code; millimetres are "
+            "expected"
         ]
     if known.max() <= 255 and (known == np.rint(known)).all():
         return [
             f"the true distance holds whole numbers from {known.min():.0f} to {known.max():.0f} alone, as codes of 8 "
-            "bits do: is it in millimetres, and finer?"
+            "bits do; millimetres, and parts of them, are expected"
         ]
     return []
 
@@ -314,7 +315,7 @@ def _contradiction(fit: Fit) -> str:
     return (
         "poses and true distances contradict each other: distances seen from two frames differ by "
         f"{fit.error_as_given:.1%} (median; at most {CONTRADICTION:.0%} is expected), and no reading of them that is "
-        "known explains it: is it the calibration of these images, and does the wall stand still?"
+        "known explains it: the calibration may be of other images, or the wall moves"
     )
 
 

@@ -1,4 +1,4 @@
-"""The report of a light fit: brightness against distance, residuals, parameters, errors on withheld keyframes."""
+"""The report of a light fit: brightness against distance, residuals, parameters, errors on what was withheld."""
 
 from __future__ import annotations
 
