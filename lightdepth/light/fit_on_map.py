@@ -50,6 +50,7 @@ MU_SLACK = 0.5  # below mu 0: noise pulls the fit of a light without spread as f
 PRIOR_GAMMA, PRIOR_MU = 0.6, 2.0  # deviations from the defaults that nobody would be surprised at
 MOST_BLIND = 0.4  # of the valid pixels saturated, or black; a real frame of C3VD, which light still tells, has .32
 GAIN_NEEDED = 0.95  # a light must leave at most this share of the error of what it replaces, or it knows nothing
+MOST_FITTED, MOST_JUDGING = 16, 10  # keyframes: more take longer, and changed no verdict on real maps
 POINTS_PER_WITNESS = 50.0  # neighbouring points share texture and slant: so many count as one against the prior
 
 
@@ -164,7 +165,7 @@ def fit_on_map(
     most of the image is saturated or black.
     """
     check_shared_frames(sparse_map, frames)
-    every = map_views(frames, sparse_map, camera, most=16)
+    every = map_views(frames, sparse_map, camera, most=MOST_FITTED)
     _check_lit(sparse_map.source, every)
     drawn = [(view, found) for view in every if len(found := samples_of(view)) >= least]
     if len(drawn) < 4:
@@ -178,11 +179,12 @@ def fit_on_map(
     gamma, mu, uncertainty, residuals, bound = fit_samples(samples, rng)
     fold_of = {submap.id: submap_folds(submap, FOLDS) for submap in sparse_map.submaps}
     hiding = [_fitted_without(views, {i: of == fold for i, of in fold_of.items()}, least) for fold in range(FOLDS)]
+    judging = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(MOST_JUDGING, len(views))).astype(int))]
     judge, default = judge or DeclineModel(details=False), [PhotometricCalibration()] * FOLDS
     errors = {
-        "constant": hidden_error(views, ConstantModel(), default, place),
-        "default": hidden_error(views, judge, default, place),
-        "fitted": hidden_error(views, judge, hiding, place),
+        "constant": hidden_error(judging, ConstantModel(), default, place),
+        "default": hidden_error(judging, judge, default, place),
+        "fitted": hidden_error(judging, judge, hiding, place),
     }
     fitted = PhotometricCalibration(gamma=gamma, mu=mu, source="measured")
     return LightFit(
@@ -191,7 +193,7 @@ def fit_on_map(
         errors,
         "median |mapped - found| / mapped over the points in blocks of wall that nothing else saw, wrong points "
         "included",
-        (len(views), len(views)),
+        (len(views), len(judging)),
         sum(map(len, samples)),
         _shown(samples, residuals, gamma),
         bound,

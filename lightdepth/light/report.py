@@ -44,7 +44,9 @@ def light_page(fit: LightFit, what: str) -> Report:
     fitted_to = f"Fitted to {fit.points} points of {fit.keyframes[0]} keyframes, judged"
     if on_map:
         page.heading("Hidden points")
-        page.text(f"{fitted_to} by points of theirs in blocks of wall that were hidden from the fit.")
+        page.text(
+            f"{fitted_to} by points of {fit.keyframes[1]} of them, in blocks of wall that were hidden from the fit."
+        )
     else:
         page.heading("Withheld frames")
         page.text(f"{fitted_to} on {fit.keyframes[1]} others.")
