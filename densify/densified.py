@@ -123,9 +123,23 @@ class Densified:
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
         if self.merged is not None:
             self._write_joined(run, self.merged, formats, mm_per_unit)
+        self._say_if_few(run)
         run.record.update(
             {"unit": "mm" if mm_per_unit else "map units", "checkpoint": self.model, "maps": plain(records)}
         )
+
+    def _say_if_few(self, run: Run) -> None:
+        """Surfaces of a map of which most keyframes could not be aligned are written, but part of the work failed."""
+        alignments = [a for result in self.results for a in result.dense.alignments]
+        aligned = sum(a.ok for a in alignments)
+        if 2 * aligned < len(alignments):
+            first = next(a for a in alignments if not a.ok)
+            run.fail(
+                "the alignment",
+                f"{aligned} of {len(alignments)} keyframes could be aligned, fewer than half: the surfaces show little "
+                f"of the map; are these its frames, its camera and its poses? (keyframe {first.keyframe}: "
+                f"{first.reason})",
+            )
 
     def _write_joined(self, run: Run, merged: Merged, formats: tuple[str, ...], mm_per_unit: float | None) -> None:
         run.record["merge"] = plain(merged.record(mm_per_unit or 1.0))

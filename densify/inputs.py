@@ -8,16 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
+from densify.config import MethodConfig
+from densify.placing import Placing
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
-from lightdepth.light.fit_on_map import fit_assumed_light, with_light
+from lightdepth.light.fit_on_map import fit_assumed_light
+from lightdepth.light.views import with_light
 from lightdepth.maps import read_map
 from lightdepth.models import ConstantModel, DepthModel
 from lightdepth.reporting.report import number
-from lightdepth.reporting.run import Run
+from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.reconstruction import sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
@@ -64,6 +67,9 @@ def made_sparse(
     for submap in found.submaps:
         errors = number(float(np.median(submap.reprojection_errors())))
         run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
+    if found.poses is not None:
+        run.log(f"known poses: {found.poses}")
+        run.record["known_poses"] = plain(found.poses)
     if found.failed:
         reasons = summary(list(found.failed.values()))
         run.log(f"{len(found.failed)} of {len(frames)} frames found no place: {reasons}")
@@ -74,15 +80,15 @@ def made_sparse(
 
 
 def fitted_light(
-    run: Run, source: SequenceSource, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel, wanted: bool
+    run: Run, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel, config: MethodConfig, wanted: bool
 ) -> FrameSequence:
-    """The frames under the light that the map tells, where theirs is only assumed and the model does better with it.
+    """The frames under the light that the map tells, where nobody gave theirs and what the model delivers with it, by
+    these settings, is better.
 
-    They stay as they are where no fit is wanted, where the user gave a light, and for the constant model, which looks
-    at none."""
-    if not wanted or source.light is not None or isinstance(model, ConstantModel):
+    They stay as they are where no fit is wanted, and for the constant model, which looks at no light."""
+    if not wanted or isinstance(model, ConstantModel):
         return frames
-    light = fit_assumed_light(run, frames, sparse_map, model)
+    light = fit_assumed_light(run, frames, sparse_map, model, Placing(config))
     return frames if light is None else with_light(frames, light)
 
 

@@ -25,7 +25,7 @@ from densify.evaluation.judged_map import (
 from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged
 from densify.evaluation.suite import Suite, present, read_suite
 from densify.evaluation.trajectory import read_trajectories, trajectory_files
-from densify.evaluation.truth import read_truth
+from densify.evaluation.truth import check_truth, read_truth
 from densify.inputs import check_unit, map_and_frames
 from densify.judging.withheld import Withheld, WithheldOfMap, withheld_errors
 from lightdepth.command_line.presets import shipped
@@ -73,6 +73,9 @@ class JudgingConfig:
     predict folder; surfaces are judged without it). A larger one judges farther wall too."""
     common: bool = False
     """Judge only the frames that both sides have, where there are others."""
+    trust_truth: bool = False
+    """Judge even by truth that contradicts its own poses by more than 2 %, or whose unit is unlikely to be
+    millimetres."""
 
     def __post_init__(self) -> None:
         check_unit(self.mm_per_unit)
@@ -161,6 +164,7 @@ def judge_asked(asked: Asked, model: DepthModel | None, out: Run) -> Answer:
         try:
             if judged.is_dir() and any(judged.glob("*.npz")):
                 frames = asked.source.sequence(folder).open()
+                check_truth(frames, asked.config.trust_truth)
                 found[name] = judge_depth(judged, frames, asked.config.max_depth_mm, asked.config.common)
                 continue
             frames, maps, points = _maps(asked, name, model, out)
@@ -184,8 +188,10 @@ def _maps(
     judged, folder = asked.pairs[name]
     if model is None or map_folders(judged) or judged.is_file():
         frames, maps = asked.source.sequence(folder).open(), read_models(judged, asked.trajectory)
+        check_truth(frames, asked.config.trust_truth)
         return frames, maps, withheld_errors(judged) if asked.suite else []
     sparse_map, frames = map_and_frames(out, asked.source.sequence(folder), judged, SfmConfig())
+    check_truth(frames, asked.config.trust_truth)
     maps, points = _made_dense(frames, sparse_map, model, out.folder / name if asked.suite else out.folder)
     poses = asked.trajectory or (judged if trajectory_files(judged) else None)
     return frames, with_trajectories(maps, read_trajectories(poses)) if poses else maps, points

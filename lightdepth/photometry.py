@@ -32,7 +32,7 @@ class PhotometricCalibration:
     """Light and response of one endoscope. `position_mm` in camera axes; `direction` is normalised at birth.
 
     `reflectance` is the share of light that the wall throws back for others to receive (radiosity's rho).
-    `source` says where the numbers come from: measured, published or assumed.
+    `source` says where the numbers come from: measured, published, given (by somebody who did not say) or assumed.
     """
 
     gamma: float = DEFAULT_GAMMA
@@ -66,6 +66,11 @@ class PhotometricCalibration:
             raise InputError("light", "direction is zero", "expected a vector into the scene such as [0, 0, 1]")
         object.__setattr__(self, "direction", tuple(float(v) / length for v in self.direction))
         object.__setattr__(self, "position_mm", tuple(map(float, self.position_mm)))
+
+    @property
+    def assumed(self) -> bool:
+        """Whether nobody gave this light: it is another endoscope's, whatever its numbers are."""
+        return self.source == "assumed"
 
     def co_located(self) -> PhotometricCalibration:
         """The same light moved to the camera centre and turned along the axis: what an up-to-scale distance can use."""

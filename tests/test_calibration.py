@@ -97,14 +97,14 @@ def test_lights_survive_their_file(tmp_path):
     )
 
 
-def test_what_a_light_file_leaves_out_is_the_default(tmp_path):
+def test_what_a_light_file_leaves_out_is_the_default_and_the_light_was_given(tmp_path):
     light = read_light(written(tmp_path / "light.json", {"gamma": 1.6}))
-    assert light == PhotometricCalibration(gamma=1.6)
+    assert light == PhotometricCalibration(gamma=1.6, source="given")
 
 
 @pytest.mark.parametrize("text", ["gamma=2.2,mu=0", "gamma=2.2, mu=0", "mu=0"])
 def test_a_light_can_be_written_out_on_the_command_line(text):
-    assert read_light(text) == PhotometricCalibration(gamma=2.2, mu=0.0)
+    assert read_light(text) == PhotometricCalibration(gamma=2.2, mu=0.0, source="given")
 
 
 def test_a_file_whose_name_has_an_equals_sign_is_still_a_file(tmp_path):

@@ -425,7 +425,7 @@ def test_a_map_that_no_keyframe_fits_is_4_and_the_other_is_written(frames, data,
     points.write_text("\n".join(kept) + "\n")
     argv = ["--map", tmp_path / "slam", "--checkpoint", "decline", "--judge.on", "false"]
     assert lightdepth("densify", frames, *argv, "-o", tmp_path / "out") == 4
-    assert "1 part(s) failed, the first: map_001: " in capsys.readouterr().err
+    assert "2 part(s) failed, the first: map_001: " in capsys.readouterr().err
     assert "map_000" in left_in(tmp_path / "out") and "map_001" not in left_in(tmp_path / "out")
     assert "report.html" in left_in(tmp_path / "out")
 

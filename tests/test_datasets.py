@@ -220,7 +220,7 @@ def test_a_c3vd_tree_is_found_by_looking_and_read_back_to_the_depth_s_step(c3vd)
         off = (frame.true_distance - found.true_distance)[known] * ray_z[known]
         assert off.min() > -1e-4 and off.max() < step * 1.1
         np.testing.assert_allclose(found.true_world_from_cam, frame.true_world_from_cam, atol=1e-6)
-        assert found.camera == LENS and found.light.source == "published"
+        assert found.camera == LENS and found.light.assumed
         assert np.abs(found.image - frame.image).max() < 1e-6
 
 

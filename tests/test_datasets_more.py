@@ -50,7 +50,7 @@ def test_the_other_trees_of_c3vd_are_found_by_looking_and_read_with_their_own_ca
     read = open_sequence(tmp_path / "seq")
     assert read.names[1] == ("0001" if tree == "v2" else "0001_color")
     check_against_truth(read, given, 100 / 65535)
-    assert open_sequence(tmp_path / "seq", "c3vd")[0].light.source == "published"
+    assert open_sequence(tmp_path / "seq", "c3vd")[0].light.assumed
 
 
 def test_the_files_of_c3vd_s_second_edition_are_named_and_coded_as_they_are_shipped(tmp_path):

@@ -12,13 +12,15 @@ import pytest
 from colons import CAMERA, colon, sequence
 from raising import refused
 
+from densify.evaluation.truth import check_truth
 from lightdepth.calibration import write_light
 from lightdepth.camera import KannalaBrandt, Pinhole
-from lightdepth.datasets import open_sequence, write_folder
-from lightdepth.datasets.checks import AS_GIVEN, check_sequence, comb_ratio, fitting_reading
+from lightdepth.datasets import FrameSequence, open_sequence, write_c3vd, write_folder
+from lightdepth.datasets.checks import check_sequence, comb_ratio, fitting_reading
 from lightdepth.files.images import read_image
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.pose_readings import AS_GIVEN
 from lightdepth.tube import lens
 
 LENS = lens("c3vd", 100, 80)
@@ -85,16 +87,110 @@ def test_poses_and_distances_that_fit_are_taken_without_a_word(camera, seed):
 
 
 def test_coarse_and_noisy_truth_is_no_contradiction():
-    """Steps of 0.78 mm as in SimCol3D, and poses off by a millimetre."""
-    rng = np.random.default_rng(0)
-    coarse = [replace(f, true_distance=np.float32(200 / 255) * np.rint(f.true_distance * 255 / 200)) for f in frames()]
-    check_sequence(sequence(coarse))
+    """Depth in steps of 0.78 mm as in SimCol3D, and poses off by a third of a millimetre."""
+    rng, ray_z = np.random.default_rng(0), CAMERA.rays()[0][..., 2].astype(np.float32)
+    step = np.float32(200 / 255)
+    coarse = [replace(f, true_distance=step * np.rint(f.true_distance * ray_z / step) / ray_z) for f in frames()]
 
     def shaken(pose: np.ndarray) -> np.ndarray:
-        pose[:3, 3] += rng.normal(0, 1, 3)
+        pose[:3, 3] += rng.normal(0, 0.3, 3)
         return pose
 
-    check_sequence(sequence(with_poses(frames(), shaken)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_sequence(sequence(coarse))
+        check_sequence(sequence(with_poses(frames(), shaken)))
+
+
+def contradicting(how: str, folder: Path) -> FrameSequence:
+    """A sequence whose poses and truth contradict each other, and no known reading explains it."""
+    rng = np.random.default_rng(0)
+    if how == "undistorted, read by the built-in fisheye":
+        write_c3vd(colon(0, 10, 12.0, Pinhole(100, 80, 70, 70, 50, 40)).frames, folder)
+        return open_sequence(folder)
+
+    def elsewhere(pose: np.ndarray) -> np.ndarray:
+        pose[:3, 3] += rng.normal(0, 2 if how == "shaken by 2 mm" else 1e9, 3)
+        return pose
+
+    return sequence(with_poses(frames()[:1] + colon(0, 10, 12.0).frames[1:4], elsewhere))
+
+
+@pytest.mark.parametrize(
+    "how, said",
+    [
+        ("undistorted, read by the built-in fisheye", r"differ by 1\d\.\d% \(median; at most 2% is expected\)"),
+        ("shaken by 2 mm", r"differ by \d\.\d% \(median"),
+        ("far apart", "by its poses no frame sees the wall that the next one sees"),
+    ],
+)
+def test_a_contradiction_that_no_reading_explains_is_warned_of_with_its_figure_and_nothing_is_judged_by_it(
+    how, said, tmp_path
+):
+    with pytest.warns(UserWarning, match=f"poses and true distances contradict each other: .*{said}"):
+        opened = check_sequence(contradicting(how, tmp_path / "seq"))
+    with refused(found="poses and true distances contradict each other", cure="--trust-truth"):
+        check_truth(opened)
+    check_truth(opened, trusted=True)
+
+
+def test_pixels_whose_truth_or_ray_is_no_number_do_not_hide_a_contradiction():
+    rng = np.random.default_rng(0)
+
+    def shaken(pose: np.ndarray) -> np.ndarray:
+        pose[:3, 3] += rng.normal(0, 2, 3)
+        return pose
+
+    def holed(frame: Frame) -> Frame:
+        distance = frame.true_distance.copy()
+        distance[:30], distance[50:] = np.nan, np.inf
+        return replace(frame, true_distance=distance)
+
+    fit = fitting_reading([holed(f) for f in with_poses(frames(), shaken)])
+    assert np.isfinite(fit.error_as_given) and fit.error_as_given > 0.02
+
+
+def test_frames_that_are_far_apart_and_see_nothing_in_common_are_judged_by_their_neighbours():
+    made = colon(0, 10, 12.0).frames
+    far = [replace(f, true_world_from_cam=pose) for f, pose in zip(made, poses_of_three_places(made), strict=True)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_sequence(sequence(far))
+
+
+def poses_of_three_places(made: list[Frame]) -> list[np.ndarray]:
+    """Poses of which first, middle and last are metres apart, each with its neighbour beside it."""
+    found = []
+    for i, frame in enumerate(made):
+        pose = frame.true_world_from_cam.copy()
+        pose[0, 3] += 1e6 * (i // 3 if i < 9 else 3)
+        found.append(pose)
+    return found
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda d: d / 255, r"would be 0\.\d+ mm \(median\): it may be in metres, or a code"),
+        (lambda d: np.rint(d * 255 / d.max()), "whole numbers from .* alone, as codes of 8 bits do"),
+        (lambda d: np.rint(d * 655), r"would be \d+.* mm \(median\)"),
+    ],
+    ids=["codes from 0 to 1", "codes of 8 bits", "codes of 16 bits"],
+)
+def test_truth_in_codes_is_warned_of_with_its_figure_and_nothing_is_judged_by_it(change, said):
+    coded = [
+        replace(f, true_distance=change(f.true_distance).astype(np.float32), true_world_from_cam=None) for f in frames()
+    ]
+    says(coded, said)
+    with refused(found="nothing can be judged by its truth", cure="--trust-truth"):
+        check_truth(sequence(coded))
+
+
+def test_truth_of_few_levels_is_warned_of_and_still_judges():
+    step = np.float32(200 / 255)
+    coarse = [replace(f, true_distance=step * np.rint(f.true_distance / step)) for f in frames()]
+    says(coarse, r"only \d+ different values, 0\.78 mm apart")
+    check_truth(sequence(coarse))
 
 
 def test_depth_taken_for_distance_and_the_other_way_round_is_seen():

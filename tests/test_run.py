@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -174,3 +175,21 @@ def test_progress_in_a_log_is_a_line_now_and_then_and_one_at_the_end(capsys):
     with pytest.raises(ValueError), Progress("Rendering", 5):
         raise ValueError
     assert capsys.readouterr().err == ""
+
+
+def test_what_is_warned_of_during_a_run_is_shown_and_in_its_log_and_run_json(tmp_path):
+    with (
+        pytest.warns(UserWarning, match="principal point"),
+        pytest.warns(FutureWarning, match="a library"),
+        run_folder(tmp_path / "out", "predict", {}) as run,
+    ):
+        warnings.warn("seq: the principal point is far off", stacklevel=1)
+        warnings.warn("a library's own business", FutureWarning, stacklevel=1)
+        run.warn("most of it is black")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.warn("after the run", stacklevel=1)
+    said = ["seq: the principal point is far off", "most of it is black"]
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["warnings"] == said
+    log = (tmp_path / "out" / "log.txt").read_text()
+    assert all(f" warning: {each}\n" in log for each in said) and "library" not in log

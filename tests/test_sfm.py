@@ -13,7 +13,8 @@ from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
 from lightdepth.sfm.config import SfmConfig
-from lightdepth.sfm.features import evened, usable_pixels
+from lightdepth.sfm.features import evened, far_matches, features_and_matches, usable_pixels, write_images
+from lightdepth.sfm.known_poses import fitting_poses
 from lightdepth.sfm.reconstruction import fisheye_fit, sparse_map_from_frames
 
 HALF = np.array([22.0, 18.0, 45.0])  # the box reaches from -HALF to HALF, in mm
@@ -244,3 +245,52 @@ def test_a_video_with_a_cut_in_the_middle_gives_two_submaps(tmp_path):
     other = [Frame(f"{6 + k}", render(PINHOLE, pose(k + 12), 1 - sheets), PINHOLE) for k in range(6)]
     found = sparse_map_from_frames([*film(PINHOLE, 6, 0), *other], tmp_path / "sparse", SfmConfig(max_features=1500))
     assert sorted([k.number for k in s.keyframes] for s in found.submaps) == [list(range(6)), list(range(6, 12))]
+
+
+WRONG_POSES = {
+    "inverted": (np.linalg.inv, "with the poses inverted: they are camera-from-world"),
+    "OpenGL": (lambda p: p @ np.diag([1.0, -1, -1, 1]), "with the camera's y and z axes turned: they are OpenGL's"),
+    "both": (
+        lambda p: np.linalg.inv(p @ np.diag([1.0, -1, -1, 1])),
+        "with the poses inverted: … and the camera's y and z axes turned",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def matched(tmp_path_factory):
+    """Verified matches of a film, and its poses by file name, from which a map would be triangulated."""
+    work = tmp_path_factory.mktemp("matched")
+    for folder in ("images", "masks"):
+        (work / folder).mkdir()
+    config = SfmConfig(max_features=800)
+    written = write_images(film(PINHOLE, 6), work / "images", work / "masks", config, lambda *_: None)
+    names = sorted(written.names)
+    features_and_matches(work, PINHOLE, names, config, lambda *_: None)
+    return far_matches(work, names, 40), {name: pose(k) for k, name in enumerate(names)}
+
+
+def test_matches_meet_in_front_of_cameras_whose_poses_are_right_and_rough_poses_are_not_accused(matched):
+    matches, poses = matched
+    fit = fitting_poses(matches, poses, PINHOLE, np.eye(4))
+    assert fit.share > 0.9 and fit.px < 1 and fit.matches > 300 and not fit.poor
+    rng = np.random.default_rng(0)
+    rough = {name: p.copy() for name, p in poses.items()}
+    for p in rough.values():
+        p[:3, 3] += rng.normal(0, 1, 3)
+    assert fitting_poses(matches, rough, PINHOLE, np.eye(4)).share < fit.share
+
+
+@pytest.mark.parametrize("how", WRONG_POSES)
+def test_poses_read_the_wrong_way_are_refused_with_the_reading_that_fits_and_both_figures(matched, how):
+    matches, poses = matched
+    change, message = WRONG_POSES[how]
+    with refused(message, where="known poses", found="matches meet in front", cure="% meet ("):
+        fitting_poses(matches, {name: change(p) for name, p in poses.items()}, PINHOLE, np.eye(4))
+
+
+def test_poses_of_another_film_are_poor_and_no_reading_is_blamed(matched):
+    matches, poses = matched
+    rng = np.random.default_rng(1)
+    others = dict(zip(poses, rng.permutation(list(poses.values())), strict=True))
+    assert fitting_poses(matches, others, PINHOLE, np.eye(4)).share < 0.5

@@ -43,7 +43,7 @@ def densify(
         formats: Formats of the mesh files to write: ply, and glb and obj besides if wanted.
         mm_per_unit: Millimetres per map unit, where known; lengths are then written in mm. A larger one makes a
             larger surface.
-        fit_light: Where nobody gave the light, fit it on the map and use it if withheld keyframes agree.
+        fit_light: Where nobody gave the light, fit it on the map and use it if hidden blocks of wall agree.
         merge: Join submaps that see the same tissue, and give each group one surface besides the single ones.
         merging: when two submaps are one
         overwrite: Replace a run made before.
@@ -68,10 +68,11 @@ def densify(
     with run_folder(output, "densify", arguments, overwrite) as run:
         sparse_map, frames = map_and_frames(run, source, map, sfm)
         run.hash_inputs(**source.files, map=map)
-        frames = fitted_light(run, source, frames, sparse_map, model, fit_light)
+        frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         work = Densified.make(frames, sparse_map, model, config, merging if merge else None)
         work.write(run, formats, mm_per_unit)
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
+        notes += [f"Warning: {said}" for said in run.record["warnings"]]
         page = densify_page("Densified maps", work.results, work.gallery, notes, None, mm_per_unit)
         if work.merged is not None:
             joined_section(page, work.merged)

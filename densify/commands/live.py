@@ -68,7 +68,7 @@ def live(
     with run_folder(output, "live", arguments, overwrite) as run:
         sparse_map, frames = map_and_frames(run, source, map, sfm)
         run.hash_inputs(**source.files, map=map)
-        frames = fitted_light(run, source, frames, sparse_map, model, fit_light)
+        frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         result = PlayedRun(run, config.coverage, mm_per_unit)
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:
             played = play(frames, sparse_map, model, config, result.add, rate, lambda _: bar.advance())

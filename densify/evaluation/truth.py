@@ -13,6 +13,7 @@ from densify.dense_map import Surface
 from densify.evaluation.errors import CUBE_MM, TrueSurface, depth_triangles, true_cloud
 from densify.evaluation.trajectory import span
 from lightdepth.datasets import FrameSequence
+from lightdepth.datasets.checks import unusable_truth
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 
@@ -32,6 +33,18 @@ class Truth:
     period: float | None
     surface: TrueSurface | None
     no_surface: str = ""
+
+
+def check_truth(frames: FrameSequence, trusted: bool = False) -> None:
+    """Raises InputError where the truth contradicts its own poses or cannot be in millimetres, unless it is trusted:
+    nothing can be judged by it. What is wrong was warned of when the frames were opened."""
+    wrong = [] if trusted else unusable_truth(frames)
+    if wrong:
+        raise InputError(
+            frames.source,
+            f"nothing can be judged by its truth: {'; '.join(wrong)}",
+            "correct it, or give --trust-truth to judge by it all the same",
+        )
 
 
 def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bool = True) -> Truth:

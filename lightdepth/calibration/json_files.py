@@ -39,7 +39,7 @@ class _LightFile(BaseModel):
     direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
     gain: float = 1.0
     reflectance: float = 0.0
-    source: Literal["measured", "published", "assumed"] = "assumed"
+    source: Literal["measured", "published", "given", "assumed"] = "given"
 
 
 def read_camera_json(path: Path) -> CameraModel:

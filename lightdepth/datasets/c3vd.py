@@ -9,7 +9,7 @@
 Colour and depth are paired by integer. Depth 0 (no data) and 65535 (clipped at 100 mm) are both unknown. Poses
 (`pose.txt`) are camera-to-world [mm], 16 numbers a line, column by column in the present release and row by row in the
 oldest: each line shows which. Screenings and deformations have no depth. The lenses are the authors' Scaramuzza models;
-the light was never calibrated, EndoMapper's values are used (same endoscope).
+the light was never calibrated: EndoMapper's values are assumed (same endoscope).
 """
 
 from __future__ import annotations
@@ -63,7 +63,6 @@ C3VD_V2 = Scaramuzza(
 """The camera of C3VD, second and third edition (as the third's tools have it), at full size."""
 FULL_SCALE_MM = 100.0
 _DEPTH = DepthCode("C3VD", 65535, FULL_SCALE_MM, clipped=65535)
-LIGHT = PhotometricCalibration(gamma=2.2, mu=2.767, source="published")
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def read_c3vd(
         path,
         images,
         camera,
-        light or LIGHT,
+        light or PhotometricCalibration(),
         mask,
         names=names,
         times=[number / 30.0 for number in numbers],

@@ -13,7 +13,7 @@ and the file's own does not.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,10 +23,15 @@ from lightdepth.datasets.sequence import FrameSequence, border_mask
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.pose_readings import AS_GIVEN, INVERSE, POSE_READINGS, as_is
 from lightdepth.sparse_map import check_rigid
 
 _SAMPLES = 600  # pixels of a frame whose points are looked for in another
 _FITS, _BETTER = 0.05, 0.3  # a reading explains the data: median error below the first, and this share of the file's
+CONTRADICTION = 0.02
+"""Median difference of the distances of one point seen from two frames, from which poses and truth contradict."""
+_PLAUSIBLE_MM = 1.0, 1000.0  # median distance of the wall from an endoscope
+_LEAST_KNOWN = 100  # pixels of known distance from which their values say something
 _GOOD = 0.005  # below this median error nothing else is tried
 _LEAST_SEEN = 0.1  # share of the points that have to fall on known distance
 _COMBED = 1.3  # comb ratio from which an image looks interlaced; real progressive endoscopy: 1.01 to 1.22
@@ -38,12 +43,7 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
     Raises InputError where poses and truth contradict each other and another reading fits; warns of what is unlikely.
     A frame that cannot be read is left out: it is refused when it is asked for.
     """
-    frames = []
-    for i in sequence.sampled:
-        try:
-            frames.append(sequence[i])
-        except InputError:
-            continue
+    frames = _readable(sequence, sequence.sampled)
     if not frames:
         return sequence
     for message in (
@@ -51,13 +51,17 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
         *_light_doubts(frames[0].light),
         *_mask_doubts(frames),
         *_truth_doubts(frames),
+        *_unit_doubts(frames),
+        *_level_doubts(frames),
         *_comb_doubts(frames),
     ):
         warnings.warn(f"{sequence.source}: {message}", stacklevel=3)
     for frame in frames:
         if frame.true_world_from_cam is not None:
             check_rigid(frame.true_world_from_cam, f"{sequence.source}: {frame.name}")
-    fit = fitting_reading(frames)
+    fit = _fit_of(sequence, frames)
+    if fit is not None and fit.best == AS_GIVEN and fit.error_as_given > CONTRADICTION:
+        warnings.warn(f"{sequence.source}: {_contradiction(fit)}", stacklevel=3)
     if fit is not None and fit.best != AS_GIVEN:
         raise InputError(
             sequence.source,
@@ -66,6 +70,26 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
             f"they agree to {fit.error:.1%} {fit.best}",
         )
     return sequence
+
+
+def unusable_truth(sequence: FrameSequence) -> list[str]:
+    """Why nothing can be judged by the truth of a sequence: it contradicts its poses, or is not in millimetres."""
+    frames = _readable(sequence, sequence.sampled)
+    fit = _fit_of(sequence, frames) if frames else None
+    return [
+        *_unit_doubts(frames),
+        *([_contradiction(fit)] if fit is not None and fit.error_as_given > CONTRADICTION else []),
+    ]
+
+
+def _readable(sequence: FrameSequence, rows: Iterable[int]) -> list[Frame]:
+    frames = []
+    for i in rows:
+        try:
+            frames.append(sequence[i])
+        except InputError:
+            continue
+    return frames
 
 
 # ---- camera, light, mask, image
@@ -137,6 +161,41 @@ def _truth_doubts(frames: Sequence[Frame]) -> list[str]:
     return []
 
 
+def _known_distances(frames: Sequence[Frame]) -> np.ndarray:
+    """All true distances (n,) of the frames that are known."""
+    truths = [frame.true_distance for frame in frames if frame.true_distance is not None]
+    return np.concatenate([np.zeros(0), *(truth[np.isfinite(truth) & (truth > 0)] for truth in truths)])
+
+
+def _unit_doubts(frames: Sequence[Frame]) -> list[str]:
+    known = _known_distances(frames)
+    if len(known) < _LEAST_KNOWN or np.ptp(known) == 0:
+        return []
+    middle = float(np.median(known))
+    if not _PLAUSIBLE_MM[0] <= middle <= _PLAUSIBLE_MM[1]:
+        return [
+            f"the true distance would be {middle:.3g} mm (median): it may be in metres, or a code; millimetres are "
+            "expected"
+        ]
+    if known.max() <= 255 and (known == np.rint(known)).all():
+        return [
+            f"the true distance holds whole numbers from {known.min():.0f} to {known.max():.0f} alone, as codes of 8 "
+            "bits do; millimetres, and parts of them, are expected"
+        ]
+    return []
+
+
+def _level_doubts(frames: Sequence[Frame]) -> list[str]:
+    known = _known_distances(frames)
+    levels = np.unique(known)
+    if len(known) < _LEAST_KNOWN or not 2 < len(levels) <= 256 or _unit_doubts(frames):
+        return []
+    return [
+        f"the true distance has only {len(levels)} different values, {np.median(np.diff(levels)):.2g} mm apart, as if "
+        "coded in 8 bits: smaller errors cannot be told"
+    ]
+
+
 def _comb_doubts(frames: Sequence[Frame]) -> list[str]:
     if any(frame.true_distance is not None for frame in frames):
         return []  # C3VD's video is interlaced, and its truth registered to it: there is nothing to be done
@@ -204,27 +263,6 @@ def _scaled(factor: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
-def _transposed(pose: np.ndarray) -> np.ndarray:
-    pose = pose.copy()
-    pose[:3, :3] = pose[:3, :3].T
-    return pose
-
-
-def _opengl(pose: np.ndarray) -> np.ndarray:
-    return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def _left_handed(pose: np.ndarray) -> np.ndarray:
-    flip = np.diag([1.0, -1.0, 1.0, 1.0])
-    result: np.ndarray = flip @ pose @ flip
-    return result
-
-
-def _as_is(pose: np.ndarray) -> np.ndarray:
-    return pose
-
-
-AS_GIVEN = "as given"
 _UNITS = {
     1000.0: "multiplied by 1000: they are in metres, the distances in millimetres",
     100.0: "multiplied by 100",
@@ -233,20 +271,13 @@ _UNITS = {
     0.01: "divided by 100",
     0.001: "divided by 1000: they are in millimetres, the distances in metres",
 }
-INVERSE = "with the poses inverted: they are camera-from-world (w2c), expected is world-from-camera (c2w)"
 READINGS: dict[str, Reading] = {
-    AS_GIVEN: Reading(_as_is, _same),
-    INVERSE: Reading(np.linalg.inv, _same),
-    "with the rotations transposed: they are written column by column": Reading(_transposed, _same),
-    "with the camera's y and z axes turned: they are OpenGL's (y up, z backwards), expected is y down, z forward": (
-        Reading(_opengl, _same)
-    ),
-    "with y mirrored: the poses are in left-handed axes, as Unity's": Reading(_left_handed, _same),
+    **{name: Reading(meant, _same) for name, meant in POSE_READINGS.items()},
     "with the truth taken as depth along the axis and divided by the ray's z; expected is distance along the ray": (
-        Reading(_as_is, lambda depth, ray_z: depth / ray_z)
+        Reading(as_is, lambda depth, ray_z: depth / ray_z)
     ),
     "with the truth multiplied by the ray's z: depth was taken for distance once too often": (
-        Reading(_as_is, lambda distance, ray_z: distance * ray_z)
+        Reading(as_is, lambda distance, ray_z: distance * ray_z)
     ),
     **{f"with the translations {text}": Reading(_scaled(factor), _same) for factor, text in _UNITS.items()},
     **{
@@ -258,6 +289,34 @@ READINGS: dict[str, Reading] = {
     },
 }
 """What poses and distances might mean, by how a message says it."""
+
+
+def _fit_of(sequence: FrameSequence, frames: Sequence[Frame]) -> Fit | None:
+    """How well the poses and truth of the frames fit; where these see no common wall, with those that follow them."""
+    both = [f for f in frames if f.true_world_from_cam is not None and len(_known_distances([f]))]
+    fit = fitting_reading(frames)
+    if fit is not None or len(both) < 2:
+        return fit
+    following = {i + 1 for i in sequence.sampled if i + 1 < len(sequence)} - set(sequence.sampled)
+    neighbours = [*frames, *_readable(sequence, sorted(following))]
+    fit = fitting_reading(neighbours)
+    numbers = sorted(f.number for f in neighbours if f.true_world_from_cam is not None)
+    if fit is None and 1 in np.diff(numbers):
+        return Fit(float("inf"), AS_GIVEN, float("inf"))
+    return fit
+
+
+def _contradiction(fit: Fit) -> str:
+    if not np.isfinite(fit.error_as_given):
+        return (
+            "poses and true distances contradict each other: by its poses no frame sees the wall that the next one "
+            "sees, and no reading of them that is known explains it"
+        )
+    return (
+        "poses and true distances contradict each other: distances seen from two frames differ by "
+        f"{fit.error_as_given:.1%} (median; at most {CONTRADICTION:.0%} is expected), and no reading of them that is "
+        "known explains it: the calibration may be of other images, or the wall moves"
+    )
 
 
 def fitting_reading(frames: Sequence[Frame]) -> Fit | None:
@@ -282,10 +341,11 @@ def fitting_reading(frames: Sequence[Frame]) -> Fit | None:
 def _error(frames: Sequence[Frame], reading: Reading) -> float:
     """Median over the pairs of frames that see the same surface, of their median relative errors; else infinity."""
     pairs = [(a, b) for i, a in enumerate(frames) for b in frames[i + 1 :]]
-    errors = [e for a, b in pairs for e in (_pair_error(a, b, reading),) if e is not None]
+    errors = [e for a, b in pairs if (e := _pair_error(a, b, reading)) is not None and np.isfinite(e)]
     return float(np.median(errors)) if errors else float("inf")
 
 
+@np.errstate(all="ignore")  # a reading may divide by a ray's z, and a lens may have none there
 def _pair_error(a: Frame, b: Frame, reading: Reading) -> float | None:
     """Median relative difference between where points of `a` should be from `b` and what is known there."""
     assert a.true_distance is not None and b.true_distance is not None
@@ -300,8 +360,8 @@ def _pair_error(a: Frame, b: Frame, reading: Reading) -> float | None:
     b_from_a = np.linalg.inv(reading.pose(b.true_world_from_cam)) @ reading.pose(a.true_world_from_cam)
     points = rays * distance[:, None] @ b_from_a[:3, :3].T + b_from_a[:3, 3]
     pixels, seen = b.camera.project(points)
-    u = np.clip(pixels[:, 0].astype(int), 0, b.camera.width - 1)
-    v = np.clip(pixels[:, 1].astype(int), 0, b.camera.height - 1)
+    seen &= np.isfinite(pixels).all(1) & np.isfinite(points).all(1)
+    u, v = np.where(seen[:, None], pixels, 0).clip(0, (b.camera.width - 1, b.camera.height - 1)).astype(int).T
     known = reading.distance(b.true_distance[v, u].astype(np.float64), b.camera.rays()[0][v, u, 2])
     seen &= b.valid[v, u] & np.isfinite(known) & (known > 0)
     if seen.sum() < max(20, _LEAST_SEEN * len(rows)):

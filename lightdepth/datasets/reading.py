@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +16,7 @@ from lightdepth.datasets.video import VideoFile, read_video, video_at
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, read_image
 from lightdepth.frame import check_image_size
+from lightdepth.photometry import PhotometricCalibration
 
 _DATA_SETS = (c3vd.FORMAT, simcol.FORMAT, hamlyn.FORMAT, scared.FORMAT, endoslam.FORMAT, endomapper.FORMAT)
 _BY_NAME = {data_set.name: data_set for data_set in (folder.FORMAT, *_DATA_SETS)}
@@ -33,7 +35,8 @@ def open_sequence(
 ) -> FrameSequence:
     """Frames at `path`, of a format found by looking or named; lazy but for a few frames that are checked.
 
-    `light` and `mask` are files (light also `gamma=2.2,mu=0`) that win over what is in the folder. Camera, in order:
+    `light` and `mask` are files (light also `gamma=2.2,mu=0`) that win over what is in the folder; a light from here
+    was given, even where its file calls it assumed. Camera, in order:
     the file given; the format's own; the map's. For EndoMapper the map's wins, because its maps were not made with the
     published calibration. `check_sequence` says what is doubtful.
     """
@@ -81,7 +84,7 @@ def _open(
     else:
         data_set = _looks_like(path) or folder.FORMAT
     images = data_set.images(path)
-    chosen_light = read_light(light) if light is not None else None
+    chosen_light = None if light is None else _given(read_light(light))
     first = legible(list_images(images))
     chosen_mask = read_mask(Path(mask), first) if mask is not None else None
     chosen = _read_camera(Path(camera), images) if camera is not None else None
@@ -90,6 +93,11 @@ def _open(
     if chosen is None and map_camera is not None and not data_set.has_camera(path):
         chosen = _at_size_of_images(map_camera, images)
     return data_set.read(path, chosen, chosen_light, chosen_mask)
+
+
+def _given(light: PhotometricCalibration) -> PhotometricCalibration:
+    """A light that somebody chose, which nothing that is found on a map replaces."""
+    return replace(light, source="given") if light.assumed else light
 
 
 def _is_cluster(path: Path, format: str | None) -> bool:
@@ -147,7 +155,7 @@ def _open_video(
         size = (opened.width, opened.height) if Path(camera).suffix.lower() == ".txt" else None
         chosen = read_camera(Path(camera), size)
         check_image_size(str(video), opened.width, opened.height, chosen)
-    chosen_light = read_light(light) if light is not None else None
+    chosen_light = None if light is None else _given(read_light(light))
     chosen_mask = read_mask(Path(mask)) if mask is not None else None
     return read_video(video, chosen, chosen_light, chosen_mask, map_camera)
 

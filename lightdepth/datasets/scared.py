@@ -33,7 +33,7 @@ import numpy as np
 from lightdepth.calibration.opencv import read_matrices
 from lightdepth.camera import Brown, CameraModel, camera_from_params
 from lightdepth.camera_conversion import without_k3
-from lightdepth.datasets.checks import AS_GIVEN, INVERSE, READINGS, fitting_reading
+from lightdepth.datasets.checks import READINGS, fitting_reading
 from lightdepth.datasets.folder import image_folder
 from lightdepth.datasets.format import Format
 from lightdepth.datasets.scared_files import IMAGES, VIDEO, numbered_members
@@ -43,6 +43,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.images import decode_raw, read_image, read_raw, unit_range
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.pose_readings import AS_GIVEN, INVERSE
 from lightdepth.sparse_map import check_rigid
 
 _DATA, _POINTS = ("frame_data", r"frame_data(\d+)\.json"), ("scene_points", r"scene_points(\d+)\.tiff?")

@@ -72,7 +72,7 @@ def open_source(source: SequenceSource) -> tuple[Source, list[Path]]:
         width=first.camera.width,
         height=first.camera.height,
         camera=None if missing else first.camera,
-        light=None if first.light == PhotometricCalibration() else first.light,
+        light=None if first.light.assumed else first.light,
         mask=first.mask,
         no_camera=missing,
     )

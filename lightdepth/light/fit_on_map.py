@@ -14,32 +14,43 @@ makes it larger. lightdepth.light.fit_on_truth finds the endoscope's own, from f
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
+from lightdepth.blocks import submap_folds
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.decline import BLUR, V_FLOOR, masked_blur
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame, check_image_size, to_batch
-from lightdepth.models import ConstantModel, DeclineModel, working_size
-from lightdepth.observations import observed_distances
+from lightdepth.frame import to_batch
+from lightdepth.light.views import (
+    FOLDS,
+    SATURATED,
+    LightView,
+    Model,
+    Place,
+    blind_share,
+    hidden_error,
+    map_views,
+    one_scale,
+    parted,
+)
+from lightdepth.models import ConstantModel, DeclineModel
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness
-from lightdepth.prediction import DepthPrediction
 from lightdepth.reporting.run import Run, plain
-from lightdepth.robust import lmeds_scale, mad_sigma, robust_weights
-from lightdepth.sparse_map import Keyframe, SparseMap, Submap
+from lightdepth.robust import mad_sigma, robust_weights
+from lightdepth.sparse_map import SparseMap
 
-Model = Callable[[Frame], DepthPrediction]
-
-SATURATED = 0.97
 GAMMAS, MUS = np.arange(0.6, 4.01, 0.2), np.arange(0.0, 6.01, 0.5)
 GAMMA_RANGE, MU_RANGE = (0.5, 5.0), (0.0, 10.0)
+MU_SLACK = 0.5  # below mu 0: noise pulls the fit of a light without spread as far
 PRIOR_GAMMA, PRIOR_MU = 0.6, 2.0  # deviations from the defaults that nobody would be surprised at
+MOST_BLIND = 0.4  # of the valid pixels saturated, or black; a real frame of C3VD, which light still tells, has .32
+GAIN_NEEDED = 0.95  # a light must leave at most this share of the error of what it replaces, or it knows nothing
+MOST_FITTED, MOST_JUDGING = 16, 10  # keyframes: more take longer, and changed no verdict on real maps
 POINTS_PER_WITNESS = 50.0  # neighbouring points share texture and slant: so many count as one against the prior
 
 
@@ -58,13 +69,14 @@ class LightSamples:
 
 @dataclass(frozen=True)
 class LightFit:
-    """A fitted light and what keyframes that took no part in the fit say about it.
+    """A fitted light, and what judges of it that took no part in the fit.
 
-    `errors` of constant, default and fitted on the withheld keyframes, in the words of `measure`; `light` is the
-    fitted one where it is better than the default there, else the default. `uncertainty` holds standard deviations
-    (bootstrap over keyframes), `points` the number fitted, `shown` (n, 3) what a plot needs: log distance, log V freed
-    of everything but distance, residual of log distance. `cosine_exponent` and `candidates` (name, error on withheld
-    frames, calibration, exponent) where normals were known.
+    `errors` of constant, default and fitted on what was withheld, in the words of `measure`; `light` is the fitted one
+    where nothing speaks against it, else the default. `bound` is where the fit ended at the end of its range.
+    `uncertainty` holds standard deviations (bootstrap over keyframes), `keyframes` how many were fitted and how many
+    judged, `points` the number fitted, `shown` (n, 3) what a plot needs: log distance, log V freed of everything but
+    distance, residual of log distance. `cosine_exponent` and `candidates` (name, error on withheld frames, calibration,
+    exponent) where normals were known.
     """
 
     fitted: PhotometricCalibration
@@ -74,12 +86,25 @@ class LightFit:
     keyframes: tuple[int, int]
     points: int
     shown: np.ndarray
+    bound: str = ""
     cosine_exponent: float | None = None
     candidates: tuple[tuple[str, float, PhotometricCalibration, float], ...] = ()
 
     @property
+    def refused(self) -> str:
+        """Why the fitted light is not used; empty where it is."""
+        e = self.errors
+        if self.bound:
+            return f"{self.bound}, so it says nothing"
+        if not e["fitted"] <= GAIN_NEEDED * e["constant"]:
+            return f"a constant distance does as well or better ({e['constant']:.1%})"
+        if not e["fitted"] <= GAIN_NEEDED * e["default"]:
+            return f"the default light does as well or better ({e['default']:.1%})"
+        return ""
+
+    @property
     def better(self) -> bool:
-        return self.errors["fitted"] < self.errors["default"]
+        return not self.refused
 
     @property
     def light(self) -> PhotometricCalibration:
@@ -89,53 +114,19 @@ class LightFit:
         e = self.errors
         text = (
             f"gamma {self.fitted.gamma:.2f} ± {self.uncertainty['gamma']:.2f}, mu {self.fitted.mu:.2f} ± "
-            f"{self.uncertainty['mu']:.2f}; withheld keyframes {e['fitted']:.1%} against {e['default']:.1%} with the "
+            f"{self.uncertainty['mu']:.2f}; {self.judges} {e['fitted']:.1%} against {e['default']:.1%} with the "
             f"defaults, {e['constant']:.1%} with a constant"
         )
-        return text if self.better else f"{text}: not better, so the defaults (gamma 2.2, mu 2.767) are kept"
+        if self.better:
+            return text
+        text += f"; not used: {self.refused}; the defaults (gamma 2.2, mu 2.767) are kept"
+        beaten = e["default"] <= GAIN_NEEDED * e["constant"]
+        return text if beaten else f"{text}, which hardly beat a constant distance here"
 
-
-@dataclass(frozen=True)
-class LightView:
-    """A keyframe with its image, both reduced to few rows."""
-
-    submap: Submap
-    keyframe: Keyframe
-    frame: Frame
-
-
-def map_views(
-    frames: FrameSequence, sparse_map: SparseMap, camera: CameraModel | None = None, most: int = 32, rows: int = 256
-) -> list[LightView]:
-    """Keyframes, evenly chosen among those with an image, `most` in all; `camera` replaces the map's."""
-    numbers = set(frames.numbers)
-    having = [(s, k) for s in sparse_map.submaps for k in s.keyframes if k.number in numbers]
-    chosen = np.unique(np.linspace(0, len(having) - 1, min(most, len(having))).round().astype(int))
-    views = []
-    for submap, keyframe in (having[i] for i in chosen):
-        try:
-            frame = frames.by_number(keyframe.number)
-        except InputError:
-            continue  # an unreadable image is reported where every frame is needed
-        if frame is not None:
-            views.append(_reduced(submap, keyframe, frame, camera or keyframe.camera, rows))
-    return views
-
-
-def _reduced(submap: Submap, keyframe: Keyframe, frame: Frame, camera: CameraModel, rows: int) -> LightView:
-    height, width = frame.image.shape[:2]
-    if abs(width / camera.width / (height / camera.height) - 1) > 0.01:
-        check_image_size(frame.name, width, height, camera)
-    size = working_size(camera, min(rows, height))
-    small = camera if size == (camera.width, camera.height) else camera.resized(*size)
-    image, mask = frame.image, frame.mask
-    if size != (width, height):
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        if mask is not None:
-            mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-    scale = (size[0] / keyframe.camera.width, size[1] / keyframe.camera.height)
-    moved = replace(keyframe, camera=small, pixels=keyframe.pixels * scale)
-    return LightView(submap, moved, Frame(frame.name, image, small, frame.light, mask))
+    @property
+    def judges(self) -> str:
+        """What the errors were taken on."""
+        return "hidden blocks of wall" if self.cosine_exponent is None else "withheld frames"
 
 
 def samples_of(view: LightView, most: int = 800) -> LightSamples:
@@ -163,78 +154,120 @@ def fit_on_map(
     camera: CameraModel | None = None,
     rng: np.random.Generator | None = None,
     least: int = 20,
+    place: Place = one_scale,
 ) -> LightFit:
-    """The light with which the closed form explains the map: fitted on every other keyframe, judged on the rest.
+    """The light with which the closed form explains the map, judged by blocks of wall.
 
-    The judge (the closed form unless given) predicts the withheld keyframes with each light. Raises InputError when
-    fewer than four keyframes have `least` usable points.
+    They are hidden a fold at a time: the light is fitted to the other points, the judge (the closed form unless given)
+    predicts the keyframes with each light, `place` brings that to the map as it will be delivered, by the other points
+    alone, and the hidden ones say how well it did. A constant distance gets the same help. The light that is returned
+    is fitted to all points. Raises InputError when fewer than four keyframes have `least` usable points, or when
+    most of the image is saturated or black.
     """
     check_shared_frames(sparse_map, frames)
-    views, samples = [], []
-    for view in map_views(frames, sparse_map, camera):
-        found = samples_of(view)
-        if len(found) >= least:
-            views.append(view)
-            samples.append(found)
-    if len(views) < 4:
+    every = map_views(frames, sparse_map, camera, most=MOST_FITTED)
+    _check_lit(sparse_map.source, every)
+    drawn = [(view, found) for view in every if len(found := samples_of(view)) >= least]
+    if len(drawn) < 4:
         raise InputError(
             sparse_map.source,
-            f"{len(views)} keyframes with at least {least} observed points on pixels that are neither black nor "
+            f"{len(drawn)} keyframes with at least {least} observed points on pixels that are neither black nor "
             "saturated",
             "expected at least 4 to find the light from",
         )
-    gamma, mu, uncertainty, residuals = fit_samples(samples[::2], rng)
+    views, samples = [view for view, _ in drawn], [found for _, found in drawn]
+    gamma, mu, uncertainty, residuals, bound = fit_samples(samples, rng)
+    fold_of = {submap.id: submap_folds(submap, FOLDS) for submap in sparse_map.submaps}
+    hiding = [_fitted_without(views, {i: of == fold for i, of in fold_of.items()}, least) for fold in range(FOLDS)]
+    judging = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(MOST_JUDGING, len(views))).astype(int))]
+    judge, default = judge or DeclineModel(details=False), [PhotometricCalibration()] * FOLDS
+    errors = {
+        "constant": hidden_error(judging, ConstantModel(), default, place),
+        "default": hidden_error(judging, judge, default, place),
+        "fitted": hidden_error(judging, judge, hiding, place),
+    }
     fitted = PhotometricCalibration(gamma=gamma, mu=mu, source="measured")
-    judge = judge or DeclineModel(details=False)
-    lights = {"default": PhotometricCalibration(), "fitted": fitted}
-    errors = {"constant": withheld_error(views[1::2], ConstantModel(), fitted)}
-    errors.update({name: withheld_error(views[1::2], judge, light) for name, light in lights.items()})
-    used = len(samples[::2])
     return LightFit(
         fitted,
         uncertainty,
         errors,
-        "median |mapped - s predicted| / mapped over the points of the withheld keyframes, wrong points included",
-        (used, len(views) - used),
-        sum(map(len, samples[::2])),
-        _shown(samples[::2], residuals, gamma),
+        "median |mapped - found| / mapped over the points in blocks of wall that nothing else saw, wrong points "
+        "included",
+        (len(views), len(judging)),
+        sum(map(len, samples)),
+        _shown(samples, residuals, gamma),
+        bound,
     )
 
 
-def fit_assumed_light(
-    run: Run, frames: FrameSequence, sparse_map: SparseMap, judge: Model
-) -> PhotometricCalibration | None:
-    """The light that the map tells, where the frames' is only assumed and the judge does better with it; else
-    None.
+def _fitted_without(views: Sequence[LightView], hidden: Mapping[int, np.ndarray], least: int) -> PhotometricCalibration:
+    """The light of the views' points that are not hidden, by submap; the default where they are too few."""
+    seen = [samples_of(parted(view, hidden[view.submap.id])[0]) for view in views]
+    seen = [samples for samples in seen if len(samples) >= least]
+    if not seen:
+        return PhotometricCalibration()
+    gamma, mu, *_ = fit_samples(seen, draws=1)
+    return PhotometricCalibration(gamma=gamma, mu=mu, source="measured")
 
-    What was fitted goes into the run's record as `light_fit`, and why nothing was into its log.
+
+def _check_lit(source: str, views: Sequence[LightView]) -> None:
+    """Raises InputError where most pixels are saturated or black: those say nothing of distance."""
+    for share, kind in zip(blind_share(views), ("saturated", "black"), strict=True):
+        if views and share > MOST_BLIND:
+            raise InputError(
+                source,
+                f"{share:.0%} of the pixels of its frames are {kind} (median over {len(views)} keyframes)",
+                f"expected at most {MOST_BLIND:.0%}: no light explains what has no brightness of its own",
+            )
+
+
+def at_bound(gamma: float, mu: float) -> str:
+    """Which parameter the data pull to an end of its range or beyond, and the end; empty where they pull none.
+
+    A light without any spread, mu 0, is a light like others: only a pull well below it counts.
     """
-    if frames[0].light != PhotometricCalibration():
+    for name, value, low, high, slack in (("gamma", gamma, *GAMMA_RANGE, 0.0), ("mu", mu, *MU_RANGE, MU_SLACK)):
+        if value <= low - slack or value >= high:
+            return f"{name} ended at its bound of {low if value <= low else high:g}"
+    return ""
+
+
+def fit_assumed_light(
+    run: Run, frames: FrameSequence, sparse_map: SparseMap, judge: Model, place: Place = one_scale
+) -> PhotometricCalibration | None:
+    """The light that the map tells, where nobody gave the frames' and the judge does better with it; else None.
+
+    What was fitted, and whether it is used, or why nothing was fitted, is in the run's record as `light_fit`.
+    """
+    if not frames[0].light.assumed:
         return None
     start = time.perf_counter()
+    found: dict[str, object] = {"used": False}
+    light = None
     try:
-        fit = fit_on_map(frames, sparse_map, judge)
+        fit = fit_on_map(frames, sparse_map, judge, place=place)
     except InputError as error:
-        run.log(f"light assumed, not fitted: {error}")
-        return None
-    run.record["light_fit"] = plain(
-        {
+        found["summary"] = f"assumed, not fitted: {error}"
+    else:
+        light = fit.fitted if fit.better else None
+        found = {
             "summary": f"fitted on the map: {fit.summary()}",
             "fitted": fit.fitted,
             "uncertainty": fit.uncertainty,
             "errors": fit.errors,
             "used": fit.better,
-            "seconds": round(time.perf_counter() - start, 3),
         }
-    )
-    run.log(f"light {run.record['light_fit']['summary']}")
-    return fit.light if fit.better else None
+    found["seconds"] = round(time.perf_counter() - start, 3)
+    run.record["light_fit"] = plain(found)
+    run.log(f"light {found['summary']}")
+    return light
 
 
 def fit_samples(
     samples: Sequence[LightSamples], rng: np.random.Generator | None = None, draws: int = 200
-) -> tuple[float, float, dict[str, float], list[np.ndarray]]:
-    """(gamma, mu), their standard deviations, and the residuals of log distance per keyframe.
+) -> tuple[float, float, dict[str, float], list[np.ndarray], str]:
+    """(gamma, mu), their standard deviations, the residuals of log distance per keyframe, and which parameter is pulled
+    to the end of its range (`at_bound`).
 
     Objective: the mean over keyframes of the length of the shortest half of the residuals, which up to half wrong
     points cannot move, on a grid; from there Tukey's biweight by reweighted least squares, with one constant per
@@ -260,7 +293,7 @@ def fit_samples(
     deviation = np.std(again, axis=0)
     uncertainty = {"gamma": float(deviation[0]), "mu": float(deviation[1])}
     residuals = [r - _shortest_half(r)[1] for r in _residuals(samples, gamma, mu)]
-    return gamma, mu, uncertainty, residuals
+    return gamma, mu, uncertainty, residuals, at_bound(*_free(moments.sum(0), gram_prior, pull))
 
 
 def _residuals(samples: Sequence[LightSamples], gamma: float, mu: float) -> list[np.ndarray]:
@@ -284,6 +317,12 @@ def _moments(samples: LightSamples, residual: np.ndarray, sigma: float) -> np.nd
     return result
 
 
+def _free(moments: np.ndarray, gram_prior: np.ndarray, pull: np.ndarray) -> tuple[float, float]:
+    """(gamma, mu) from the normal equations, wherever they lie."""
+    half_gamma, half_mu = np.linalg.solve(moments[1:, 1:] + gram_prior, moments[1:, 0] + pull)
+    return 2 * float(half_gamma), 2 * float(half_mu)
+
+
 def _solved(moments: np.ndarray, gram_prior: np.ndarray, pull: np.ndarray) -> tuple[float, float]:
     """(gamma, mu) from the normal equations, mu not below zero."""
     gram, right = moments[1:, 1:] + gram_prior, moments[1:, 0] + pull
@@ -294,17 +333,6 @@ def _solved(moments: np.ndarray, gram_prior: np.ndarray, pull: np.ndarray) -> tu
     return float(np.clip(2 * half_gamma, *GAMMA_RANGE)), float(2 * half_mu)
 
 
-def withheld_error(views: Sequence[LightView], model: Model, light: PhotometricCalibration) -> float:
-    """Median of |mapped - s predicted| / mapped over all points of the views, s by LMedS per keyframe."""
-    errors = []
-    for view in views:
-        observed = observed_distances(view.keyframe, view.submap, model(replace(view.frame, light=light)))
-        if len(observed) >= 8:
-            scale = lmeds_scale(observed.mapped, observed.predicted).scale
-            errors.append(np.abs(observed.mapped - scale * observed.predicted) / observed.mapped)
-    return float(np.median(np.concatenate(errors))) if errors else float("inf")
-
-
 def _shown(samples: Sequence[LightSamples], residuals: Sequence[np.ndarray], gamma: float) -> np.ndarray:
     """What a plot of brightness against distance needs, (n, 3): distance over its keyframe's median."""
     parts = []
@@ -312,8 +340,3 @@ def _shown(samples: Sequence[LightSamples], residuals: Sequence[np.ndarray], gam
         log_a = s.log_distance - np.median(s.log_distance)
         parts.append(np.stack([log_a, 2 / gamma * (r - log_a), r], 1))
     return np.concatenate(parts)
-
-
-def with_light(frames: FrameSequence, light: PhotometricCalibration) -> FrameSequence:
-    """The same frames under another light."""
-    return FrameSequence(frames.names, lambda i: replace(frames[i], light=light), frames.source)

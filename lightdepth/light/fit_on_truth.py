@@ -22,7 +22,8 @@ from lightdepth.decline import V_FLOOR, masked_blur
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, to_batch
 from lightdepth.geometry import normals_from_distance
-from lightdepth.light.fit_on_map import GAMMA_RANGE, MU_RANGE, SATURATED, LightFit
+from lightdepth.light.fit_on_map import GAMMA_RANGE, MU_RANGE, LightFit, at_bound
+from lightdepth.light.views import SATURATED
 from lightdepth.models import working_size
 from lightdepth.photometry import DEFAULT_GAMMA, DEFAULT_MU, PhotometricCalibration, brightness
 from lightdepth.radiosity import indirect_irradiance
@@ -117,6 +118,7 @@ def fit_on_truth(frames: FrameSequence, rng: np.random.Generator | None = None, 
         (len(fit), len(judge)),
         sum(len(p.place) for p in fit),
         _shown(fit, state),
+        at_bound(state.gamma, state.mu),
         state.q,
         tuple((name, error, s.light(), s.q) for name, error, s in candidates),
     )

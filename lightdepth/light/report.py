@@ -1,4 +1,4 @@
-"""The report of a light fit: brightness against distance, residuals, parameters, errors on withheld keyframes."""
+"""The report of a light fit: brightness against distance, residuals, parameters, errors on what was withheld."""
 
 from __future__ import annotations
 
@@ -41,8 +41,15 @@ def light_page(fit: LightFit, what: str) -> Report:
             "A map knows no normals: this is the light with which the closed form errs least, every wall taken as "
             "facing. In a tube its gamma is smaller than the endoscope's own, light from wall to wall makes it larger."
         )
-    page.heading("Withheld keyframes")
-    page.text(f"Fitted to {fit.points} points of {fit.keyframes[0]} keyframes, judged on {fit.keyframes[1]} others.")
+    fitted_to = f"Fitted to {fit.points} points of {fit.keyframes[0]} keyframes, judged"
+    if on_map:
+        page.heading("Hidden points")
+        page.text(
+            f"{fitted_to} by points of {fit.keyframes[1]} of them, in blocks of wall that were hidden from the fit."
+        )
+    else:
+        page.heading("Withheld frames")
+        page.text(f"{fitted_to} on {fit.keyframes[1]} others.")
     labels = {"constant": "constant", "default": "default light", "fitted": "fitted light"}
     page.table(["", fit.measure], [[labels[name], error] for name, error in fit.errors.items()])
     if fit.candidates:

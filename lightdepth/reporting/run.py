@@ -16,12 +16,13 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.writing import move_whole, write_whole
@@ -45,12 +46,15 @@ class Run:
 
     def __init__(self, folder: Path, verb: str, arguments: Mapping[str, Any]):
         self.folder = folder
-        self.record: dict[str, Any] = {"failures": []}
+        self.record: dict[str, Any] = {"failures": [], "warnings": []}
         self._verb, self._arguments, self._start = verb, plain(arguments), time.time()
 
     def log(self, message: str) -> None:
         """A line for the user and for log.txt."""
         print(message, flush=True)
+        self._note(message)
+
+    def _note(self, message: str) -> None:
         with (self.folder / "log.txt").open("a") as file:
             file.write(f"{time.strftime('%H:%M:%S')} {message}\n")
 
@@ -59,11 +63,40 @@ class Run:
         self.record["failures"].append({"what": what, "reason": reason})
         self.log(f"failed: {what}: {reason}")
 
+    def warn(self, message: str) -> None:
+        """Something is doubtful; the work goes on. It is in the log and in run.json."""
+        self.record["warnings"].append(message)
+        self.log(f"warning: {message}")
+
     def hash_inputs(self, **paths: Path | None) -> None:
         """Notes what files and folders were read, by name; None is one that was not given."""
         for name, path in paths.items():
             if path is not None:
                 self.record.setdefault("inputs", {})[name] = {"path": str(path), "sha256": input_hash(path)}
+
+    @contextmanager
+    def hearing(self) -> Iterator[None]:
+        """What is warned of meanwhile, by whom ever, is in log.txt and run.json too."""
+        shown = warnings.showwarning
+
+        def heard(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            shown(message, category, filename, lineno, file, line)
+            if issubclass(category, UserWarning):  # a library's deprecations are no news to a user
+                self.record["warnings"].append(str(message))
+                self._note(f"warning: {message}")
+
+        warnings.showwarning = heard
+        try:
+            yield
+        finally:
+            warnings.showwarning = shown
 
     def finish(self) -> None:
         import yaml
@@ -102,7 +135,8 @@ def run_folder(output: Path, verb: str, arguments: Mapping[str, Any], overwrite:
         raise InputError(output, f"cannot be made ({error.strerror})", "choose another -o") from error
     run = Run(staging, verb, arguments)
     try:
-        yield run
+        with run.hearing():
+            yield run
         run.finish()
     except BaseException:
         shutil.rmtree(staging, ignore_errors=True)

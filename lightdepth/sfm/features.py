@@ -23,6 +23,9 @@ from lightdepth.sfm.config import ADVICE, Progress, SfmConfig
 from lightdepth.sfm.retrieval import frame_pairs
 from lightdepth.sfm.unmapped import Matching
 
+GOOD_MATCH = 30
+"""Verified matches from which a pair of frames says something about their poses."""
+
 
 def frame_file(name: str) -> str:
     """The name of a frame's keyframe and image file."""
@@ -128,6 +131,30 @@ def features_and_matches(
                     found.append((one, other, len(geometry.inlier_matches), int(geometry.config) in flat))
     rows = np.array(found, int).reshape(-1, 4)
     return Matching(features, rows[:, :2], rows[:, 2], rows[:, 3] > 0)
+
+
+def far_matches(work: Path, names: list[str], most: int) -> list[tuple[str, str, np.ndarray, np.ndarray]]:
+    """Verified matches of frames `names` that are far apart: each of `most` of them, evenly chosen, with the last one
+    that it matches well. The two names, and where the matched features are, (n, 2) each."""
+    pc = pycolmap()
+    with quiet(pc), pc.Database.open(work / "database.db") as opened:
+        by_id = {opened.read_image_with_name(name).image_id: name for name in names}
+        last: dict[str, tuple[str, np.ndarray]] = {}
+        for pair_id, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            one, other = (by_id.get(i, "") for i in pc.pair_id_to_image_pair(pair_id))
+            rows = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
+            if one > other:
+                one, other, rows = other, one, rows[:, ::-1]
+            if one and other and len(rows) >= GOOD_MATCH and (one not in last or last[one][0] < other):
+                last[one] = other, rows
+        firsts = sorted(last)
+        ids = {name: image_id for image_id, name in by_id.items()}
+        found = []
+        for i in np.unique(np.linspace(0, len(firsts) - 1, min(most, len(firsts))).round().astype(int)):
+            one, (other, rows) = firsts[i], last[firsts[i]]
+            a, b = (np.asarray(opened.read_keypoints(ids[name]))[:, :2].astype(float) for name in (one, other))
+            found.append((one, other, a[rows[:, 0]], b[rows[:, 1]]))
+    return found
 
 
 def _pairs(database: Any, ids: list[int], config: SfmConfig) -> list[tuple[int, int]]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import logging
 import shutil
 import tempfile
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,11 +31,14 @@ from lightdepth.maps import read_map
 from lightdepth.maps.colmap import holds_model
 from lightdepth.native import pycolmap
 from lightdepth.sfm.config import ADVICE, Progress, SfmConfig
-from lightdepth.sfm.features import features_and_matches, frame_file, quiet, write_images
+from lightdepth.sfm.features import far_matches, features_and_matches, frame_file, quiet, write_images
+from lightdepth.sfm.known_poses import PosesFit, fitting_poses
 from lightdepth.sfm.unmapped import reasons, summary
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap, check_rigid
 
 log = logging.getLogger(__name__)
+
+_JUDGED = 40  # pairs of frames by whose matches known poses are judged
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class SfmMap(SparseMap):
     """A sparse map, and the frames that found no place in it, by name, with the likely reason."""
 
     failed: dict[str, str] = field(default_factory=dict)
+    poses: PosesFit | None = None
+    """how well the matches fit the poses, where these were known"""
 
     @property
     def unregistered(self) -> tuple[str, ...]:
@@ -59,7 +65,8 @@ def sparse_map_from_frames(
 
     Keyframes are named by their frame's number, six digits, `.png`. With `poses`, map_from_cam (4, 4) by frame number,
     nothing is moved: points are triangulated at these poses, in their unit, and there is one submap. Raises
-    InputError, leaving out_folder as it was, when the frames cannot be mapped or the folder already holds a map.
+    InputError, leaving out_folder as it was, when the frames cannot be mapped, the folder already holds a map, or the
+    matches fit the poses only when these are read in another way, which is named.
     """
     config, progress, out_folder = config or SfmConfig(), progress or _silent, Path(out_folder)
     _check_free(out_folder)
@@ -72,12 +79,17 @@ def sparse_map_from_frames(
         written = write_images(frames, images, masks, config, progress)
         fit = fisheye_fit(written.camera, written.valid) if isinstance(written.camera, Scaramuzza) else None
         camera, names = fit.camera if fit else written.camera, sorted(written.names)
-        known = None if poses is None else _known_poses(poses, written.names, fit)
+        known = None if poses is None else _known_poses(poses, written.names)
         matching = features_and_matches(Path(work), camera, names, config, progress)
+        fitting = None
         if known is None:
             count = _reconstruct(Path(work), len(names), config, progress)
         else:
-            count = _triangulated(Path(work), known, config, progress)
+            fitting = fitting_poses(far_matches(Path(work), sorted(known), _JUDGED), known, camera, _turn(fit))
+            if fitting.poor:
+                warnings.warn(f"known poses: only {fitting}: are they the poses of these frames?", stacklevel=2)
+            at = {name: _turn(fit) @ np.linalg.inv(pose) for name, pose in known.items()}
+            count = _triangulated(Path(work), at, config, progress)
         submaps = read_map(models).submaps if count else ()
         if fit:
             submaps = tuple(_with_camera(s, written.camera, fit.rotation) for s in submaps)
@@ -97,27 +109,30 @@ def sparse_map_from_frames(
         _move_models(models, out_folder)
     if failed:
         log.warning("%d of %d frames are not in the map: %s", len(failed), len(frames), summary(list(failed.values())))
-    return SfmMap(submaps, str(out_folder), failed)
+    return SfmMap(submaps, str(out_folder), failed, fitting)
 
 
-def _known_poses(
-    poses: Mapping[int, np.ndarray], names: Mapping[str, str], fit: Conversion | None
-) -> dict[str, np.ndarray]:
-    """cam_from_map (4, 4) by file name, of the camera that COLMAP is given."""
-    turn = np.eye(4)
-    if fit:
-        turn[:3, :3] = fit.rotation
+def _known_poses(poses: Mapping[int, np.ndarray], names: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """map_from_cam (4, 4) by file name."""
     known = {}
     for name in names:
         pose = poses.get(frame_number(name))
         if pose is not None:
             check_rigid(pose, f"pose of frame {frame_number(name)}")
-            known[name] = turn @ np.linalg.inv(pose)
+            known[name] = pose
     if len(known) < 2:
         raise InputError(
             "known poses", f"{len(known)} of {len(names)} frames have one", "triangulation needs at least 2"
         )
     return known
+
+
+def _turn(fit: Conversion | None) -> np.ndarray:
+    """(4, 4) from the axes of the frames' camera to those of the camera that COLMAP is given."""
+    turn = np.eye(4)
+    if fit:
+        turn[:3, :3] = fit.rotation
+    return turn
 
 
 def fisheye_fit(camera: CameraModel, valid: np.ndarray) -> Conversion:

@@ -14,7 +14,7 @@ import lightning.pytorch as pl
 
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
-from lightdepth.light.fit_on_map import LightView, map_views, withheld_error
+from lightdepth.light.views import LightView, map_views, withheld_error
 from lightdepth.models import DepthModel, NetworkModel
 from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run

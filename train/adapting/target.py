@@ -12,7 +12,8 @@ from lightdepth.calibration import write_camera, write_light
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.errors import InputError
-from lightdepth.light.fit_on_map import LightView, fit_assumed_light, with_light
+from lightdepth.light.fit_on_map import fit_assumed_light
+from lightdepth.light.views import LightView, with_light
 from lightdepth.losses import LossConfig
 from lightdepth.maps import read_map
 from lightdepth.models import NetworkModel

@@ -51,7 +51,7 @@ def adapt(
         checkpoint: Model to start from: a path, or the name of a bundled one.
         more: Other sequences of the same endoscope to learn from, such as '[A, B]'.
         map: Sparse map of the frames; its points find the light where nobody gave it, and judge the result.
-        fit_light: Where nobody gave the light, fit it on the map and use it if withheld keyframes agree.
+        fit_light: Where nobody gave the light, fit it on the map and use it if hidden blocks of wall agree.
         keep_worse: Write the model even when it got worse.
         overwrite: Replace a run made before.
     """
