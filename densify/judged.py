@@ -27,7 +27,7 @@ from densify.evaluation.suite import Suite, present, read_suite
 from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.evaluation.truth import read_truth
 from densify.evaluation.withheld import WithheldOfMap, withheld_errors
-from densify.inputs import check_unit, map_and_frames
+from densify.inputs import MapSource, check_unit, map_and_frames
 from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
@@ -73,6 +73,8 @@ class JudgingConfig:
     predict folder; surfaces are judged without it). A larger one judges farther wall too."""
     common: bool = False
     """Judge only the frames that both sides have, where there are others."""
+    trust_map: bool = False
+    """Go on with a map whose frames, by their images, are others than those that it was made of, and only warn."""
 
     def __post_init__(self) -> None:
         check_unit(self.mm_per_unit)
@@ -185,7 +187,10 @@ def _maps(
     if model is None or map_folders(judged) or judged.is_file():
         frames, maps = asked.source.sequence(folder).open(), read_models(judged, asked.trajectory)
         return frames, maps, withheld_errors(judged) if asked.suite else []
-    sparse_map, frames = map_and_frames(out, asked.source.sequence(folder), judged, SfmConfig())
+    mapped = MapSource(asked.config.trust_map, judged)
+    sparse_map, frames = map_and_frames(out, asked.source.sequence(folder), mapped, SfmConfig())
+    if asked.suite:
+        out.record.setdefault("pairings", {})[name] = out.record.pop("pairing")
     maps, points = _made_dense(frames, sparse_map, model, out.folder / name if asked.suite else out.folder)
     poses = asked.trajectory or (judged if trajectory_files(judged) else None)
     return frames, with_trajectories(maps, read_trajectories(poses)) if poses else maps, points
