@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,15 +15,18 @@ import pytest
 from colons import colon, sequence, slam
 from raising import refused
 
+from densify.inputs import MapSource, map_and_frames
 from lightdepth.camera import Brown, Pinhole
-from lightdepth.datasets import FrameSequence
+from lightdepth.datasets import FrameSequence, SequenceSource, write_folder
 from lightdepth.datasets.counting import Counting
 from lightdepth.detective import PairingConfig, Verdict, check_pairing, investigate
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
-from lightdepth.maps.checks import OTHER_READINGS, seen_by_projection
+from lightdepth.maps.checks import OTHER_READINGS, checked, seen_by_projection
+from lightdepth.maps.colmap import write_text_model
 from lightdepth.maps.convention import distorted
 from lightdepth.reporting.run import Run, plain
+from lightdepth.sfm.config import SfmConfig
 from lightdepth.sparse_map import Keyframe, SparseMap
 
 CAMERA = Pinhole(128, 104, 70.0, 70.0, 64.0, 52.0)
@@ -204,6 +208,46 @@ def test_a_wrong_pairing_is_an_error_and_a_trusted_one_a_warning(tmp_path):
     assert said["judgement"] == "wrong" and "1 frame later" in said["sentence"]
     assert said["figures"]["at_hand"]["ncc"] < max(other["ncc"] for other in said["figures"]["others"])
     json.dumps(plain(said), allow_nan=False)
+
+
+TURN = np.diag([1.0, -1, -1, 1])
+MISREAD: dict[str, tuple[Callable[[Keyframe], Keyframe], str]] = {
+    "c2w": (lambda k: replace(k, cam_from_map=np.linalg.inv(k.cam_from_map)), "with the inverse poses. "),
+    "OpenGL": (lambda k: replace(k, cam_from_map=TURN @ k.cam_from_map), "y and z axes turned over, as OpenGL has"),
+    "NeRF": (lambda k: replace(k, cam_from_map=np.linalg.inv(TURN @ k.cam_from_map)), "as OpenGL and NeRF have them"),
+    "poses in cm, points in mm": (lambda k: replace(k, cam_from_map=farther(k, 0.1)), "10 times as far apart"),
+    "poses in mm, points in m": (lambda k: replace(k, cam_from_map=farther(k, 1000.0)), "0.001 times as far apart"),
+    "mirrored": (lambda k: replace(k, pixels=np.abs((128, 0) - k.pixels)), "keypoints mirrored"),
+    "half size": (lambda k: replace(k, pixels=k.pixels / 2), "camera at half its size"),
+}
+
+
+def farther(keyframe: Keyframe, scale: float) -> np.ndarray:
+    pose = keyframe.cam_from_map.copy()
+    pose[:3, 3] *= scale
+    return pose
+
+
+@pytest.mark.parametrize("slip", MISREAD)
+def test_a_map_whose_keypoints_contradict_its_reading_is_refused_and_the_right_one_named(slip):
+    """Without any image: as it is read."""
+    change, named = MISREAD[slip]
+    (submap,) = each(honest_map(), change).submaps
+    with refused(cure=named):
+        checked(submap, Path("a map"))
+
+
+def test_frames_and_a_map_on_disk_meet_only_where_the_images_agree(tmp_path):
+    run, recipe = Run(tmp_path, "densify", {}), SfmConfig()
+    write_folder(shown(film()), tmp_path / "right")
+    write_folder(shown(film(), 2), tmp_path / "late")
+    write_text_model(honest_map().submaps[0], tmp_path / "map")
+    map_and_frames(run, SequenceSource(tmp_path / "right"), MapSource(map=tmp_path / "map"), recipe)
+    assert run.record["pairing"]["judgement"] == "agrees"
+    with refused(where="map", found="2 frames later", cure="frame_offset"):
+        map_and_frames(run, SequenceSource(tmp_path / "late"), MapSource(map=tmp_path / "map"), recipe)
+    with pytest.warns(UserWarning, match="2 frames later"):
+        map_and_frames(run, SequenceSource(tmp_path / "late"), MapSource(True, tmp_path / "map"), recipe)
 
 
 def test_of_several_submaps_the_one_that_does_not_belong_is_named():
