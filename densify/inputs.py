@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from densify.placing import Placing
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
+from lightdepth.detective import PairingConfig, check_pairing
 from lightdepth.errors import InputError
 from lightdepth.frame import check_image_size
 from lightdepth.light.fit_on_map import fit_assumed_light
@@ -27,15 +28,24 @@ from lightdepth.sfm.unmapped import summary
 from lightdepth.sparse_map import Keyframe, SparseMap
 
 
+@dataclass(frozen=True)
+class MapSource(PairingConfig):
+    """A sparse map, and what is asked of it."""
+
+    map: Path | None = None
+    """Sparse map of the frames: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the frames."""
+
+
 def map_and_frames(
-    run: Run, source: SequenceSource, map: Path | None, sfm: SfmConfig
+    run: Run, source: SequenceSource, mapped: MapSource, sfm: SfmConfig
 ) -> tuple[SparseMap, FrameSequence]:
-    """The map at `map`, or one made of the frames, and the frames, under the map's camera where they have none. A map
-    made at another image size is rescaled to theirs. Raises InputError where no frame is of the map."""
-    if map is None:
+    """The map that was given, or one made of the frames, and the frames, under the map's camera where they have none.
+    A map made at another image size is rescaled to theirs. Raises InputError where no frame is of the map, or where
+    the images say that they are not its."""
+    if mapped.map is None:
         frames = source.open()
         return made_sparse(run, frames, sfm), frames
-    sparse_map = read_map(map)
+    sparse_map = read_map(mapped.map)
     map_camera = sparse_map.submaps[0].keyframes[0].camera
     frames = source.open(map_camera)
     check_shared_frames(sparse_map, frames)
@@ -43,7 +53,9 @@ def map_and_frames(
     given = frames[0].camera if source.camera is not None else None
     if (map_camera.width, map_camera.height) != (width, height):
         run.log(f"map made at {map_camera.width}x{map_camera.height}, rescaled to the frames' {width}x{height}")
-    return fitted_to_frames(sparse_map, width, height, given), frames
+    fitted = fitted_to_frames(sparse_map, width, height, given)  # first: a cropped image is refused by its size
+    check_pairing(sparse_map, frames, mapped, run, given)
+    return fitted, frames
 
 
 def check_unit(mm_per_unit: float | None) -> None:

@@ -26,7 +26,7 @@ from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged
 from densify.evaluation.suite import Suite, present, read_suite
 from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.evaluation.truth import check_truth, read_truth
-from densify.inputs import check_unit, map_and_frames
+from densify.inputs import MapSource, check_unit, map_and_frames
 from densify.judging.withheld import Withheld, WithheldOfMap, withheld_errors
 from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
@@ -76,6 +76,8 @@ class JudgingConfig:
     trust_truth: bool = False
     """Judge even by truth that contradicts its own poses by more than 2 %, or whose unit is unlikely to be
     millimetres."""
+    trust_map: bool = False
+    """Go on with a map whose frames, by their images, are others than those that it was made of, and only warn."""
 
     def __post_init__(self) -> None:
         check_unit(self.mm_per_unit)
@@ -190,7 +192,10 @@ def _maps(
         frames, maps = asked.source.sequence(folder).open(), read_models(judged, asked.trajectory)
         check_truth(frames, asked.config.trust_truth)
         return frames, maps, withheld_errors(judged) if asked.suite else []
-    sparse_map, frames = map_and_frames(out, asked.source.sequence(folder), judged, SfmConfig())
+    mapped = MapSource(asked.config.trust_map, judged)
+    sparse_map, frames = map_and_frames(out, asked.source.sequence(folder), mapped, SfmConfig())
+    if asked.suite:
+        out.record.setdefault("pairings", {})[name] = out.record.pop("pairing")
     check_truth(frames, asked.config.trust_truth)
     maps, points = _made_dense(frames, sparse_map, model, out.folder / name if asked.suite else out.folder)
     poses = asked.trajectory or (judged if trajectory_files(judged) else None)

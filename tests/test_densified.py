@@ -33,7 +33,7 @@ def test_a_run_that_aligns_fewer_than_half_of_its_keyframes_is_written_and_is_4(
 
     whole = replace(slam(frames).map, submaps=tuple(part(i, n) for i, n in enumerate(few)))
     results = densify(sequence(frames), whole, truth, DensifyConfig(judge=JudgeConfig(on=False)))
-    work = Densified("truth", results, [], Gallery(whole))
+    work = Densified("truth", results, Gallery(whole))
     said = pytest.raises(PartialFailure, match="failed, the first: ")
     with said if fails else nullcontext(), run_folder(tmp_path / "run", "densify", {}) as run:
         work.write(run, ("ply",), None)

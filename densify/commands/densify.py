@@ -7,7 +7,7 @@ from typing import Literal
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
-from densify.inputs import check_unit, fitted_light, map_and_frames
+from densify.inputs import MapSource, check_unit, fitted_light, map_and_frames
 from densify.joining import MergeConfig
 from densify.page import densify_page, joined_section
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -21,7 +21,7 @@ from lightdepth.sfm.config import SfmConfig
 def densify(
     source: Group[SequenceSource],
     output: Path,
-    map: Path | None = None,
+    mapped: Group[MapSource] = MapSource(),
     checkpoint: str = DEFAULT_CHECKPOINT,
     config: Group[DensifyConfig] = DensifyConfig(),
     sfm: SfmConfig = SfmConfig(),
@@ -36,8 +36,6 @@ def densify(
 
     Args:
         output: Run folder to make, with the surfaces and the report.
-        map: Sparse map of the frames: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the
-            frames.
         checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
         sfm: how frames are mapped when there is no map
         formats: Formats of the mesh files to write: ply, and glb and obj besides if wanted.
@@ -54,9 +52,9 @@ def densify(
     model = load_model(checkpoint, details=False)  # before minutes are spent on a sparse map
     arguments = recorded(
         source,
+        mapped,
         config,
         output=output,
-        map=map,
         checkpoint=checkpoint,
         sfm=sfm,
         formats=formats,
@@ -66,8 +64,8 @@ def densify(
         merging=merging,
     )
     with run_folder(output, "densify", arguments, overwrite) as run:
-        sparse_map, frames = map_and_frames(run, source, map, sfm)
-        run.hash_inputs(**source.files, map=map)
+        sparse_map, frames = map_and_frames(run, source, mapped, sfm)
+        run.hash_inputs(**source.files, map=mapped.map)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         work = Densified.make(frames, sparse_map, model, config, merging if merge else None)
         work.write(run, formats, mm_per_unit)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from densify.config import LiveConfig
-from densify.inputs import check_unit, fitted_light, map_and_frames
+from densify.inputs import MapSource, check_unit, fitted_light, map_and_frames
 from densify.live.play import play
 from densify.live.record import PlayedRun
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -20,7 +20,7 @@ from lightdepth.sfm.config import SfmConfig
 def live(
     source: Group[SequenceSource],
     output: Path,
-    map: Path | None = None,
+    mapped: Group[MapSource] = MapSource(),
     checkpoint: str = DEFAULT_CHECKPOINT,
     rate: float | None = None,
     budget_ms: float = 200.0,
@@ -34,8 +34,6 @@ def live(
 
     Args:
         output: Run folder to make, with the surfaces and the timings.
-        map: Sparse map of the frames: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the
-            frames, before the clock starts.
         checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
         rate: Number of keyframes per second that come whether or not the last is done; left out, each comes when the
             last is done. More leave less time for each: late ones queue, none is dropped.
@@ -55,9 +53,9 @@ def live(
     model = load_model(checkpoint, details=False)
     arguments = recorded(
         source,
+        mapped,
         config,
         output=output,
-        map=map,
         checkpoint=checkpoint,
         rate=rate,
         budget_ms=budget_ms,
@@ -66,8 +64,8 @@ def live(
         fit_light=fit_light,
     )
     with run_folder(output, "live", arguments, overwrite) as run:
-        sparse_map, frames = map_and_frames(run, source, map, sfm)
-        run.hash_inputs(**source.files, map=map)
+        sparse_map, frames = map_and_frames(run, source, mapped, sfm)
+        run.hash_inputs(**source.files, map=mapped.map)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         result = PlayedRun(run, config.coverage, mm_per_unit)
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:

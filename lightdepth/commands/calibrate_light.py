@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from lightdepth.calibration import write_light
+from lightdepth.command_line.options import Group
 from lightdepth.datasets import FormatName, SequenceSource
+from lightdepth.detective import PairingConfig, check_pairing
 from lightdepth.errors import InputError
 from lightdepth.files.writing import write_together
 from lightdepth.light.fit_on_map import fit_on_map
@@ -24,6 +26,7 @@ def calibrate_light(
     camera: Path | None = None,
     mask: Path | None = None,
     seed: int = 0,
+    pairing: Group[PairingConfig] = PairingConfig(),
     overwrite: bool = False,
 ) -> None:
     """The light of an endoscope: response and spread, from a sparse map or from frames with known depth.
@@ -58,7 +61,9 @@ def calibrate_light(
     else:
         sparse_map = read_map(map)
         frames = source.open(sparse_map.submaps[0].keyframes[0].camera)
-        fit = fit_on_map(frames, sparse_map, camera=frames[0].camera if camera is not None else None, rng=rng)
+        given = frames[0].camera if camera is not None else None
+        check_pairing(sparse_map, frames, pairing, given=given)
+        fit = fit_on_map(frames, sparse_map, camera=given, rng=rng)
         what = f"{data}, {sparse_map.source}"
     write_together({page_path: light_page(fit, what).write, output: lambda path: write_light(fit.light, path)})
     print(f"light: {fit.summary()}\n{output}, {page_path}")

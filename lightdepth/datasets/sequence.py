@@ -14,6 +14,7 @@ from typing import overload
 import cv2
 import numpy as np
 
+from lightdepth.datasets.counting import BY_NUMBER, Counting
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, read_image, read_raw
 from lightdepth.frame import Frame, frame_number
@@ -79,14 +80,13 @@ class FrameSequence(Sequence[Frame]):
         """The frame with this number, or None."""
         return self[self.numbers.index(number)] if number in self.numbers else None
 
-    def of_keyframe(self, keyframe: Keyframe) -> Frame:
+    def of_keyframe(self, keyframe: Keyframe, counting: Counting = BY_NUMBER) -> Frame:
         """The image of a keyframe under the map's own camera, which knows best. Raises InputError where there is none,
         or it cannot be read."""
-        frame = self.by_number(keyframe.number)
+        number = counting.number(keyframe)
+        frame = self.by_number(number)
         if frame is None:
-            raise InputError(
-                self.source, f"no frame number {keyframe.number}", "expected the frames that the map was made of"
-            )
+            raise InputError(self.source, f"no frame number {number}", "expected the frames that the map was made of")
         return replace(frame, camera=keyframe.camera)
 
 

@@ -56,15 +56,15 @@ def checked(submap: Submap, where: Path) -> Submap:
     found = f"median reprojection error {median:.1f} px, {share:.0%} of the observations in view"
     if not share:
         found = "none of the keyframes has a point that it observed in its view"
-    fits = {what: reprojection(other(submap)) for what, other in _OTHER_READINGS.items()}
+    fits = {what: reprojection(other(submap)) for what, other in OTHER_READINGS.items()}
     fits = {what: fit for what, fit in fits.items() if fit[0] < MAX_MEDIAN_PX and fit[1] >= _MIN_SHARE_IN_VIEW}
     if fits:
         best = min(fits, key=lambda what: fits[what][0])
         raise InputError(where, found, f"it would be {fits[best][0]:.2f} px {best}")
     warnings.warn(
-        f"{where}: {found}; expected about 1 px, at most {MAX_MEDIAN_PX:g}. Inverse poses, half and double camera "
-        "size, quaternion order and undistorted keypoints do not explain it: check that cameras, images and points3D "
-        "belong together",
+        f"{where}: {found}; expected about 1 px, at most {MAX_MEDIAN_PX:g}. Inverse poses, OpenGL's axes, half and "
+        "double camera size, quaternion order, other units, mirrored and undistorted keypoints do not explain it: "
+        "check that cameras, images and points3D belong together",
         stacklevel=2,
     )
     return submap
@@ -148,7 +148,25 @@ def _undistorted(keyframe: Keyframe) -> Keyframe:
     return replace(keyframe, pixels=distorted(keyframe.camera, keyframe.pixels))
 
 
-_OTHER_READINGS: dict[str, Callable[[Submap], Submap]] = {
+def _turned_over(keyframe: Keyframe) -> Keyframe:
+    """The pose, had the camera's y been up and its z out of the scene."""
+    return replace(keyframe, cam_from_map=np.diag([1.0, -1, -1, 1]) @ keyframe.cam_from_map)
+
+
+def _mirrored(keyframe: Keyframe) -> Keyframe:
+    return replace(keyframe, pixels=np.abs((keyframe.camera.width, 0) - keyframe.pixels))
+
+
+def _longer(scale: float) -> Callable[[Keyframe], Keyframe]:
+    def change(keyframe: Keyframe) -> Keyframe:
+        pose = keyframe.cam_from_map.copy()
+        pose[:3, 3] *= scale
+        return replace(keyframe, cam_from_map=pose)
+
+    return change
+
+
+OTHER_READINGS: dict[str, Callable[[Submap], Submap]] = {
     "with the inverse poses. Poses are taken as camera-from-map (w2c) unless declared otherwise: invert them, or set "
     f'"pose_convention" to "w2c" or "c2w", whichever it is, in {SIDECAR} beside the files': _each(_inverse),
     "with the quaternions read as x y z w. Write them as w x y z": _each(_scalar_last),
@@ -158,6 +176,18 @@ _OTHER_READINGS: dict[str, Callable[[Submap], Submap]] = {
     "Correct the size and intrinsics in the cameras file": _each(_size(0.5)),
     "with the camera at double its size: the keypoints are those of images twice as large. "
     "Correct the size and intrinsics in the cameras file": _each(_size(2.0)),
+    "with the camera's y and z axes turned over, as OpenGL has them. Write poses of a camera whose y points down and "
+    "whose z points into the scene": _each(_turned_over),
+    "with the inverse poses and the camera's y and z axes turned over, as OpenGL and NeRF have them. Write "
+    "camera-from-map (w2c) poses of a camera whose y points down and z into the scene": _each(
+        lambda k: _turned_over(_inverse(k))
+    ),
+    **{
+        f"with the places of its keyframes {scale:g} times as far apart: poses and points are in different units. "
+        "Write both in one": _each(_longer(scale))
+        for scale in (0.001, 0.1, 10.0, 1000.0)
+    },
+    "with the keypoints mirrored left for right. Give those of the images as they are": _each(_mirrored),
     "with undistorted keypoints. Export the distorted ones, or put "
     f'{{"keypoints": "undistorted"}} into {SIDECAR} beside the files': _each(_undistorted),
 }

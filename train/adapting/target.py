@@ -11,6 +11,7 @@ import torch
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
+from lightdepth.detective import PairingConfig, check_pairing
 from lightdepth.errors import InputError
 from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import LightView, with_light
@@ -50,7 +51,13 @@ class Target:
 
 
 def read_target(
-    run: Run, source: SequenceSource, map: Path | None, fit_light: bool, held_out: float, start: NetworkModel
+    run: Run,
+    source: SequenceSource,
+    map: Path | None,
+    fit_light: bool,
+    held_out: float,
+    start: NetworkModel,
+    pairing: PairingConfig = PairingConfig(),
 ) -> Target:
     """The frames and their map. Where nobody gave a light, the map's points may tell it; what was used is written."""
     sparse_map = read_map(map) if map is not None else None
@@ -60,6 +67,7 @@ def read_target(
     training, held = parted(frames, held_out)
     if sparse_map is not None:
         check_shared_frames(sparse_map, frames)
+        check_pairing(sparse_map, frames, pairing, run, frames[0].camera if source.camera is not None else None)
         write_camera(frames[0].camera, run.folder / "camera.json")
         # The map's camera, where the folder has none: for all sequences.
         source = replace(source, camera=run.folder / "camera.json")

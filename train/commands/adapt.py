@@ -17,6 +17,7 @@ import lightning.pytorch as pl
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model, save_model
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
+from lightdepth.detective import PairingConfig
 from lightdepth.errors import InputError
 from lightdepth.losses import LossConfig
 from lightdepth.models import DeclineModel, NetworkModel, working_size
@@ -41,6 +42,7 @@ def adapt(
     map: Path | None = None,
     fit_light: bool = True,
     config: Group[AdaptConfig] = AdaptConfig(),
+    pairing: Group[PairingConfig] = PairingConfig(),
     keep_worse: bool = False,
     overwrite: bool = False,
 ) -> None:
@@ -64,6 +66,7 @@ def adapt(
     arguments = recorded(
         source,
         config,
+        pairing,
         output=output,
         checkpoint=checkpoint,
         more=more,
@@ -76,7 +79,7 @@ def adapt(
         raise InputError("--checkpoint", f"{checkpoint} has no weights to adapt", "expected a trained checkpoint")
     quiet()
     with run_folder(output, "adapt", arguments, overwrite) as run:
-        target = read_target(run, source, map, fit_light, config.held_out, start)
+        target = read_target(run, source, map, fit_light, config.held_out, start, pairing)
         size = config.size or working_size(target.frames[0].camera, start.rows)
         data = frame_data(run, target, more, config, size, start)
         loss = target_loss(start.card, target.light.reflectance > 0, config.replay > 0)
