@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from lightdepth.errors import InputError
 
 from .module import What
+
+HOLD = 20.0
+"""Weight of the anchor where nothing judges."""
 
 
 @dataclass(frozen=True)
@@ -27,18 +31,21 @@ class AdaptConfig:
     """Which part of the network learns: all, decoder, norms (scale and shift of the normalisations) or low_rank."""
     rank: int = 4
     """Number of ranks of what low_rank adds to every convolution. More let it change further."""
-    anchor: float = 0.0
-    """Weight that holds the shape of each distance map to what the checkpoint said before. A larger one holds it more
-    firmly."""
+    anchor: float | None = None
+    """Weight that holds the shape of each distance map to what the checkpoint said before; left out, 0 where something
+    judges, and 20 where nothing does. A larger one holds it more firmly."""
     replay: int = 0
     """Number of synthetic colons of the kind that the checkpoint learned from, which fill half of each batch; 0 for
     none. More show more variety and take longer to render."""
     points: float = 0.0
-    """Weight of the map's points as teachers; those that a held-out frame saw only judge. A larger one follows the
-    points more closely."""
+    """Weight of the map's points as teachers; those that a held-out frame saw, and a fifth of the others in
+    whole blocks of wall, only judge. A larger one follows the points more closely."""
     overlap: float = 0.0
     """Weight of the places where two keyframes of the map see the same tissue. A larger one makes their depths agree
     better."""
+    judge: Literal["auto", "none"] = "auto"
+    """What judges besides the loss: auto, true distance or a map, and where there is neither a map is made of the
+    frames; none makes no map, so that without truth and --map nothing judges."""
     held_out: float = 0.2
     """Share of each sequence, at its end, that judges and is never trained on. A larger one judges more surely and
     trains on less."""
@@ -58,6 +65,10 @@ class AdaptConfig:
             raise InputError("--points", f"{self.points}, --overlap {self.overlap}", "expected weights of 0 or more")
         if not 0 < self.held_out < 1:
             raise InputError("--held-out", f"{self.held_out}", "expected a share above 0 and below 1")
+
+    def held_on(self, judged: bool) -> float:
+        """The weight of the anchor, by whether anything judges."""
+        return self.anchor if self.anchor is not None else 0.0 if judged else HOLD
 
     @property
     def taught(self) -> bool:
