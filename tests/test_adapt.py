@@ -21,7 +21,7 @@ from lightdepth.photometry import PhotometricCalibration
 from train.adapting.card import source_colons, target_loss
 from train.adapting.judging import Judgement, verdict
 from train.adapting.module import Adaptation, anchor_loss, let_learn, merge_low_rank
-from train.adapting.wall_judge import BlockErrors
+from train.adapting.wall_judge import PointError, WallErrors
 from train.colons import TubeData
 from train.commands.adapt import adapt as adapt_verb
 from train.datamodule import FrameData, FrameDataModule, collate
@@ -107,7 +107,7 @@ def test_a_map_is_made_to_judge_frames_that_have_neither_truth_nor_map(start, se
     found = slam(colon(count=10).frames).map
     monkeypatch.setattr("train.adapting.target.made_sparse", lambda *_: found)
     record = adapted(start, sequences / "plain", tmp_path / "run", steps=2, keep_worse=True)
-    assert record["criterion"] == "map" and record["word"] != "not judged" and record["anchor"] == 0
+    assert record["criterion"] == "map" and record["word"] != "not judged" and record["anchor"] == 50
     assert adapted(start, sequences / "truth", tmp_path / "true", steps=2, keep_worse=True)["criterion"] == "truth"
 
 
@@ -138,10 +138,10 @@ def test_a_network_that_got_worse_is_not_written_unless_asked_for(start, sequenc
     assert not kept["better"] and kept["written"] and (run / "model.safetensors").is_file()
 
 
-def wall(error: float, spread: float = 0.0, frames: float | None = None, count: int = 20) -> BlockErrors:
-    """Blocks whose errors are `error`, every other one larger and smaller by `spread`, as of a map."""
-    errors = {(0, i): error + spread * (-1) ** i for i in range(count)}
-    return BlockErrors(errors, dict.fromkeys(errors, 1.0), {} if frames is None else {7: frames})
+def wall(error: float, spread: float = 0.0, frames: float | None = None, count: int = 20) -> WallErrors:
+    """Points, one to a block, whose errors are `error`, every other one larger and smaller by `spread`."""
+    points = {(0, i): PointError(i, error + spread * (-1) ** i, 1.0) for i in range(count)}
+    return WallErrors(points, {} if frames is None else {7: frames})
 
 
 def judgement(truth=None, at_wall=None, loss=1.0, inconsistency=0.1) -> Judgement:
@@ -386,7 +386,7 @@ def test_what_cannot_be_used_is_said_and_nothing_is_left_behind(start, sequences
 def test_a_map_that_teaches_keeps_quiet_about_the_frames_that_judge(start, sequences, tmp_path):
     options = {"map": sequences / "slam", "light": "gamma=2,mu=1", "keep_worse": True, "held_out": 0.3, "steps": 3}
     taught = adapted(start, sequences / "unlit", tmp_path / "taught", points=5.0, overlap=1.0, **options)
-    alone = adapted(start, sequences / "unlit", tmp_path / "alone", **options)
+    alone = adapted(start, sequences / "unlit", tmp_path / "alone", points=0.0, **options)
     assert taught["before"]["loss"] == alone["before"]["loss"] and taught["after"]["loss"] != alone["after"]["loss"]
     log = (tmp_path / "taught" / "log.txt").read_text()
     assert (

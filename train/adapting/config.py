@@ -11,6 +11,8 @@ from .module import What
 
 HOLD = 20.0
 """Weight of the anchor where nothing judges."""
+POINTS = 100.0
+"""Weight of a map's points where none is given: the light's loss, whose weights are about 1, has little say then."""
 
 
 @dataclass(frozen=True)
@@ -32,14 +34,14 @@ class AdaptConfig:
     rank: int = 4
     """Number of ranks of what low_rank adds to every convolution. More let it change further."""
     anchor: float | None = None
-    """Weight that holds the shape of each distance map to what the checkpoint said before; left out, 0 where something
-    judges, and 20 where nothing does. A larger one holds it more firmly."""
+    """Weight that holds the shape of each distance map to what the checkpoint said before; left out, half of that of
+    the map's points, and 20 where nothing judges. A larger one holds it more firmly."""
     replay: int = 0
     """Number of synthetic colons of the kind that the checkpoint learned from, which fill half of each batch; 0 for
     none. More show more variety and take longer to render."""
-    points: float = 0.0
-    """Weight of the map's points as teachers; those that a held-out frame saw, and a fifth of the others in
-    whole blocks of wall, only judge. A larger one follows the points more closely."""
+    points: float | None = None
+    """Weight of the map's points as teachers; left out, 100 where there is a map. Those that a held-out frame saw, and
+    a fifth of the others in whole blocks of wall, only judge. A larger one follows the points more closely."""
     overlap: float = 0.0
     """Weight of the places where two keyframes of the map see the same tissue. A larger one makes their depths agree
     better."""
@@ -61,16 +63,22 @@ class AdaptConfig:
                 f"{self.replay}",
                 "expected positive numbers, and 0 or more colons",
             )
-        if not (self.points >= 0 and self.overlap >= 0):
+        if not ((self.points is None or self.points >= 0) and self.overlap >= 0):
             raise InputError("--points", f"{self.points}, --overlap {self.overlap}", "expected weights of 0 or more")
         if not 0 < self.held_out < 1:
             raise InputError("--held-out", f"{self.held_out}", "expected a share above 0 and below 1")
 
-    def held_on(self, judged: bool) -> float:
-        """The weight of the anchor, by whether anything judges."""
-        return self.anchor if self.anchor is not None else 0.0 if judged else HOLD
+    def taught_by(self, has_map: bool) -> float:
+        """The weight of a map's points, by whether there is a map."""
+        return (POINTS if self.points is None else self.points) if has_map else 0.0
+
+    def held_on(self, has_map: bool, judged: bool) -> float:
+        """The weight of the anchor, by whether there is a map and whether anything judges."""
+        if self.anchor is not None:
+            return self.anchor
+        return self.taught_by(has_map) / 2 if judged else HOLD
 
     @property
     def taught(self) -> bool:
-        """Whether a map teaches."""
-        return self.points + self.overlap > 0
+        """Whether a map is asked to teach, so that one is needed."""
+        return (self.points or 0.0) + self.overlap > 0

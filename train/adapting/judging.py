@@ -24,7 +24,7 @@ from lightdepth.reporting.report import number
 
 from ..datamodule import FrameDataModule, held_out_count
 from .module import Adaptation
-from .wall_judge import BlockErrors, WallJudge, compared
+from .wall_judge import WallErrors, WallJudge, compared
 
 Criterion = Literal["truth", "map", "none"]
 Word = Literal["better", "not better", "worse", "not judged"]
@@ -33,7 +33,7 @@ MOST_INCONSISTENT = 2.0
 """Times the start's inconsistency, above which an adapted network is not accepted, whatever the map says."""
 MOST_INCONSISTENT_UNJUDGED = 1.25
 """The same where nothing judged."""
-_SURE = 2.0  # standard deviations by which blocks of wall must err less
+_SURE = 2.5  # standard deviations by which blocks of wall must err less
 _FRAMES_WORSE = 0.02  # share by which held-out frames may err more
 _NAMES = {"truth": "AbsRel of the held-out frames with truth", "map": "error at withheld blocks of wall"}
 
@@ -46,17 +46,17 @@ class Judgement:
     """errors by name, as validation gives them"""
     truth: float | None = None
     """AbsRel of depth, median-aligned per frame, where the held-out frames have truth"""
-    wall: BlockErrors | None = None
+    wall: WallErrors | None = None
     """errors at blocks of wall, where there is a map"""
 
     @property
-    def at_blocks(self) -> float | None:
-        """Mean error at blocks of wall, where there are any."""
-        return None if self.wall is None else self.wall.mean
+    def at_wall(self) -> float | None:
+        """Median error at the map's points that judge, where there are any."""
+        return None if self.wall is None else self.wall.median
 
     def record(self) -> dict[str, float | None]:
         """For run.json."""
-        return {"truth": self.truth, "map": self.at_blocks, **self.errors}
+        return {"truth": self.truth, "map": self.at_wall, **self.errors}
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _by_truth(before: float, after: float) -> Verdict:
     return Verdict("truth", word, before, after, _percent(before, after), word == "better")
 
 
-def _by_wall(before: BlockErrors, after: BlockErrors, unsteady: float) -> Verdict | None:
+def _by_wall(before: WallErrors, after: WallErrors, unsteady: float) -> Verdict | None:
     change = compared(before, after)
     if change is None:
         return None

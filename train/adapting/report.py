@@ -60,7 +60,7 @@ def page(
     three = (outcome.closed_form, before, after)
     for title, found in (
         ("AbsRel (median-aligned)", [judgement.truth for judgement in three]),
-        ("error at blocks of wall", [judgement.at_blocks for judgement in three]),
+        ("median error at the map's judging points", [judgement.at_wall for judgement in three]),
     ):
         if found[1] is not None:
             headers.append(title)

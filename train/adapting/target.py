@@ -154,14 +154,15 @@ def adaptation(
     size: tuple[int, int],
 ) -> Adaptation:
     """The start, as a module that goes on learning from the target; the blocks of `wall` judge."""
+    weights = {"points": config.taught_by(target.sparse_map is not None), "overlap": config.overlap}
     teacher = None
-    if target.sparse_map is not None and wall is not None and config.taught:
+    if target.sparse_map is not None and wall is not None and wall.taught:
         hidden = wall.hidden()
         teacher = MapTeacher(target.training, target.sparse_map, size, target.held.numbers, config.seed, hidden)
         known = sum(len(k.distances) for k in teacher.keyframes)
         paired = sum(bool(k.partners) for k in teacher.keyframes)
         run.log(f"the map teaches: {len(teacher.keyframes)} keyframes, {known} observed points, {paired} with partners")
-    anchor = config.held_on(not target.unjudged)
+    anchor = config.held_on(target.sparse_map is not None, not target.unjudged)
     if target.unjudged:
         run.log(f"nothing but the loss can judge, {target.unjudged}: held to {start.name} by an anchor of {anchor:g}")
     return Adaptation(
@@ -175,5 +176,5 @@ def adaptation(
         config.rank,
         torch.Generator().manual_seed(config.seed),
         teacher,
-        {"points": config.points, "overlap": config.overlap},
+        weights,
     )

@@ -1,8 +1,9 @@
 """Blocks of wall that judge: points of a map that no lesson showed, block by block.
 
 Notation: a distance of a point from a keyframe, t the prediction on its ray, s the keyframe's scale by LMedS over the
-points of the other folds, e = |log a - log s t|. A block's error is the median of e over all sightings of its points,
-its weight w the share of the images that lies nearer to them than to points of other blocks. With d the difference of a
+points of the other folds, e = |log a - log s t|. A point's error is the median of e over its sightings; points that
+both models miss by far are wrong points, and are left out. A block's error is the median of its points', its weight w
+the share of the images that lies nearer to them than to points of other blocks. With d the difference of a
 block's errors, after less before,
 
     change = sum w d / sum w e_before,   deviation² = sum (w (d - change e_before))² / (sum w e_before)²
@@ -35,8 +36,10 @@ LEAST_BLOCKS = 8
 _POINTS = 4  # of a block below which it is left out: wrong points lie alone
 _GRID = 32  # places along each axis of an image at which the nearest point is asked for
 
-Block = tuple[int, int]
-"""A submap's id and the block's number."""
+_WRONG = 4.0  # times the median error, from which a point that both models miss is a wrong one
+
+PointKey = tuple[int, int]
+"""A submap's id and the point's."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +51,25 @@ class Parted:
 
 
 @dataclass(frozen=True)
-class BlockErrors:
-    """The error and weight of each block, and the median error of each held-out frame, by its number."""
+class PointError:
+    """A judging point's block, its error, and the share of the images that it stands for."""
 
-    errors: Mapping[Block, float]
-    weights: Mapping[Block, float]
+    block: int
+    error: float
+    weight: float
+
+
+@dataclass(frozen=True)
+class WallErrors:
+    """The errors of the judging points, and the median error of each held-out frame, by its number."""
+
+    points: Mapping[PointKey, PointError]
     frames: Mapping[int, float]
 
     @property
-    def mean(self) -> float | None:
-        """Mean error of the blocks, weighted; None where there are none."""
-        total = sum(self.weights[key] for key in self.errors)
-        return sum(self.weights[key] * self.errors[key] for key in self.errors) / total if total > 0 else None
+    def median(self) -> float | None:
+        """Median error of the points; None where there are none."""
+        return float(np.median([point.error for point in self.points.values()])) if self.points else None
 
 
 @dataclass(frozen=True)
@@ -83,30 +93,31 @@ class WallJudge:
     held: frozenset[int]
     taught: bool
 
-    def errors(self, model: DepthModel) -> BlockErrors:
-        """What the model errs by at the blocks."""
-        sightings: dict[Block, list[np.ndarray]] = {}
-        weights: dict[Block, float] = {}
+    def errors(self, model: DepthModel) -> WallErrors:
+        """What the model errs by at the points that judge."""
+        sightings: dict[PointKey, list[tuple[float, float]]] = {}
+        blocks: dict[PointKey, int] = {}
         frames: dict[int, float] = {}
         for view in self.views:
             observed = observed_distances(view.keyframe, view.submap, model(view.frame))
             if len(observed) < LEAST_POINTS:
                 continue
             part, rows = self.parts[view.submap.id], view.submap.rows_of(observed.point_ids)[0]
-            blocks, folds, area = part.blocks[rows], part.folds[rows], _areas(view, observed)
             held = view.keyframe.number in self.held
-            errors = _errors(observed, folds, range(FOLDS) if held or not self.taught else range(1))
-            judged = np.isfinite(errors) & (blocks >= 0)
-            for block in np.unique(blocks[judged]).tolist():
-                chosen = judged & (blocks == block)
-                key = (view.submap.id, block)
-                sightings.setdefault(key, []).append(errors[chosen])
-                weights[key] = weights.get(key, 0.0) + float(area[chosen].sum())
-            if held and np.isfinite(errors).any():
-                frames[view.keyframe.number] = float(np.nanmedian(errors))
-        return BlockErrors(
-            {key: float(np.median(np.concatenate(seen))) for key, seen in sightings.items()}, weights, frames
-        )
+            errors = _errors(observed, part.folds[rows], range(FOLDS) if held or not self.taught else range(1))
+            judged = np.isfinite(errors) & (part.blocks[rows] >= 0)
+            seen = zip(rows[judged], errors[judged], _areas(view, observed)[judged], strict=True)
+            for row, error, area in seen:
+                key = (view.submap.id, int(view.submap.point_ids[row]))
+                blocks[key] = int(part.blocks[row])
+                sightings.setdefault(key, []).append((float(error), float(area)))
+            if held and judged.any():
+                frames[view.keyframe.number] = float(np.median(errors[judged]))
+        points = {}
+        for key, told in sightings.items():
+            of_point = np.array(told)
+            points[key] = PointError(blocks[key], float(np.median(of_point[:, 0])), float(of_point[:, 1].sum()))
+        return WallErrors(points, frames)
 
     def hidden(self) -> dict[int, np.ndarray]:
         """Ids of the points that no lesson may show, by submap id."""
@@ -121,20 +132,32 @@ def wall_judge(frames: FrameSequence, held: FrameSequence, sparse_map: SparseMap
     return WallJudge(tuple(views), parts, frozenset(held.numbers), taught)
 
 
-def compared(before: BlockErrors, after: BlockErrors) -> Change | None:
+def compared(before: WallErrors, after: WallErrors) -> Change | None:
     """The change of the blocks that both know, or None where these are too few to tell."""
-    keys = [key for key in before.errors if key in after.errors and before.weights[key] > 0]
-    if len(keys) < LEAST_BLOCKS:
+    keys = [key for key in before.points if key in after.points]
+    if not keys:
         return None
-    w = np.array([before.weights[key] for key in keys])
-    first, second = (np.array([found.errors[key] for key in keys]) for found in (before, after))
+    old, new = ([found.points[key] for key in keys] for found in (before, after))
+    errors = np.array([[a.error, b.error] for a, b in zip(old, new, strict=True)])
+    blocks = np.unique(
+        [[key[0], point.block] for key, point in zip(keys, old, strict=True)], axis=0, return_inverse=True
+    )
+    of_block, weights = blocks[1].reshape(-1), np.array([point.weight for point in old])
+    least = errors.min(1)
+    right = least <= _WRONG * np.median(least)
+    rows = [np.flatnonzero(right & (of_block == block)) for block in range(int(of_block.max()) + 1)]
+    rows = [row for row in rows if weights[row].sum() > 0]
+    if len(rows) < LEAST_BLOCKS:
+        return None
+    w = np.array([weights[row].sum() for row in rows])
+    first, second = np.array([np.median(errors[row], axis=0) for row in rows]).T
     total = float((w * first).sum())
     if not total > 0:
         return None
     change = float((w * second).sum()) / total - 1
     deviation = float(np.sqrt(np.square(w * (second - first - change * first)).sum())) / total
     mean = total / float(w.sum())
-    return Change(mean, mean * (1 + change), change, deviation, len(keys))
+    return Change(mean, mean * (1 + change), change, deviation, len(rows))
 
 
 def _parted(submap: Submap, seed: int) -> Parted:

@@ -53,8 +53,8 @@ def adapt(
         output: Run folder to make, with the adapted model and a report.
         checkpoint: Model to start from: a path, or the name of a bundled one.
         more: Other sequences of the same endoscope to learn from, such as '[A, B]'.
-        map: Sparse map of the frames; its points find the light where nobody gave it, and judge the result. Left out,
-            pycolmap makes one of frames without truth.
+        map: Sparse map of the frames; its points find the light where nobody gave it, teach, and judge the result. Left
+            out, pycolmap makes one of frames without truth.
         fit_light: Where nobody gave the light, fit it on the map and use it if withheld keyframes agree.
         sfm: how frames are mapped when there is neither truth nor map
         keep_worse: Write the model even when it is not better.
@@ -88,7 +88,8 @@ def adapt(
         loss = target_loss(start.card, target.light.reflectance > 0, config.replay > 0)
         wall = None
         if target.sparse_map is not None:
-            wall = wall_judge(target.frames, target.held, target.sparse_map, config.taught, config.seed)
+            taught = config.taught_by(True) + config.overlap > 0
+            wall = wall_judge(target.frames, target.held, target.sparse_map, taught, config.seed)
         module = adaptation(run, target, start, loss, wall, config, size)
 
         pictures = Pictures(target)
