@@ -111,6 +111,16 @@ def test_a_map_is_made_to_judge_frames_that_have_neither_truth_nor_map(start, se
     assert adapted(start, sequences / "truth", tmp_path / "true", steps=2, keep_worse=True)["criterion"] == "truth"
 
 
+def test_a_map_that_is_too_poor_to_judge_lets_the_network_be_held_near_its_start(start, sequences, tmp_path):
+    whole = slam(colon(count=10).frames).map
+    first = whole.submaps[0]
+    few = replace(first, point_ids=first.point_ids[:12], points=first.points[:12])
+    write_multimap(replace(whole, submaps=(few,)), tmp_path / "slam")
+    record = adapted(start, sequences / "plain", tmp_path / "run", map=tmp_path / "slam", steps=2)
+    assert record["word"] == "not judged" and record["anchor"] == 20 and "too few points" in record["verdict"]
+    assert "the map teaches nothing" in (tmp_path / "run" / "log.txt").read_text()
+
+
 @pytest.mark.parametrize(("value", "said"), [(0.0, "100% of the frames are black"), (1.0, "100% white")])
 def test_frames_that_show_nothing_are_refused(start, tmp_path, value, said):
     frames = colon(count=6).frames

@@ -157,11 +157,12 @@ def adaptation(
     weights = {"points": config.taught_by(target.sparse_map is not None), "overlap": config.overlap}
     teacher = None
     if target.sparse_map is not None and wall is not None and wall.taught:
-        hidden = wall.hidden()
-        teacher = MapTeacher(target.training, target.sparse_map, size, target.held.numbers, config.seed, hidden)
-        known = sum(len(k.distances) for k in teacher.keyframes)
-        paired = sum(bool(k.partners) for k in teacher.keyframes)
-        run.log(f"the map teaches: {len(teacher.keyframes)} keyframes, {known} observed points, {paired} with partners")
+        try:
+            teacher = _teacher(run, target, target.sparse_map, wall, size, config.seed)
+        except InputError as error:
+            if config.taught:
+                raise
+            run.log(f"the map teaches nothing: {error}")
     anchor = config.held_on(target.sparse_map is not None, not target.unjudged)
     if target.unjudged:
         run.log(f"nothing but the loss can judge, {target.unjudged}: held to {start.name} by an anchor of {anchor:g}")
@@ -178,3 +179,14 @@ def adaptation(
         teacher,
         weights,
     )
+
+
+def _teacher(
+    run: Run, target: Target, sparse_map: SparseMap, wall: WallJudge, size: tuple[int, int], seed: int
+) -> MapTeacher:
+    """The map as a teacher that keeps quiet about what judges."""
+    teacher = MapTeacher(target.training, sparse_map, size, target.held.numbers, seed, wall.hidden())
+    known = sum(len(k.distances) for k in teacher.keyframes)
+    paired = sum(bool(k.partners) for k in teacher.keyframes)
+    run.log(f"the map teaches: {len(teacher.keyframes)} keyframes, {known} observed points, {paired} with partners")
+    return teacher

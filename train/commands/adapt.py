@@ -10,7 +10,7 @@ network better, no model is written. Where nothing judges, the network is held n
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import lightning.pytorch as pl
@@ -29,7 +29,7 @@ from ..adapting.judging import Outcome, judged, looked_at, verdict
 from ..adapting.module import Adaptation, merge_low_rank
 from ..adapting.report import Pictures, page
 from ..adapting.target import Target, adaptation, frame_data, read_target, replayed_frames
-from ..adapting.wall_judge import wall_judge
+from ..adapting.wall_judge import compared, wall_judge
 from ..callbacks import Diagnosis, DiagnosisConfig, TrainingProgress
 from ..datamodule import FrameDataModule
 from ..running import quiet, report_every
@@ -90,12 +90,14 @@ def adapt(
         if target.sparse_map is not None:
             taught = config.taught_by(True) + config.overlap > 0
             wall = wall_judge(target.frames, target.held, target.sparse_map, taught, config.seed)
+        closed = looked_at(DeclineModel(details=False), target.held, wall)
+        if closed.truth is None and closed.wall is not None and compared(closed.wall, closed.wall) is None:
+            target = replace(target, unjudged="the map has too few points to judge")
         module = adaptation(run, target, start, loss, wall, config, size)
 
         pictures = Pictures(target)
         pictures.add(start)
         before = judged(module, data, start, target.held, wall)
-        closed = looked_at(DeclineModel(details=False), target.held, wall)
         _fit(module, data, config.steps, run)
         merge_low_rank(module.network)
         adapted = NetworkModel(module.network, size[1], output.name, details=False)
