@@ -146,7 +146,7 @@ def _by_wall(before: WallErrors, after: WallErrors, unsteady: float) -> Verdict 
     why = f" ({100 * change.change:+.1f} ± {100 * change.deviation:.1f} % over {change.blocks} blocks"
     why += ")" if frames is None else f"; held-out frames {100 * frames:+.1f} %)"
     word: Word = "not better"
-    if change.change > _SURE * change.deviation:
+    if change.change > change.deviation:
         word = "worse"
     elif change.change < -_SURE * change.deviation and (frames is None or frames <= _FRAMES_WORSE):
         word = "better"
