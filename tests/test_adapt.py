@@ -108,7 +108,8 @@ def test_a_map_is_made_to_judge_frames_that_have_neither_truth_nor_map(start, se
     monkeypatch.setattr("train.adapting.target.made_sparse", lambda *_: found)
     record = adapted(start, sequences / "plain", tmp_path / "run", steps=2, keep_worse=True)
     assert record["criterion"] == "map" and record["word"] != "not judged" and record["anchor"] == 50
-    assert adapted(start, sequences / "truth", tmp_path / "true", steps=2, keep_worse=True)["criterion"] == "truth"
+    by_truth = adapted(start, sequences / "truth", tmp_path / "true", steps=2, keep_worse=True)
+    assert by_truth["criterion"] == "truth" and by_truth["anchor"] == 0
 
 
 def test_a_map_that_is_too_poor_to_judge_lets_the_network_be_held_near_its_start(start, sequences, tmp_path):
@@ -397,6 +398,7 @@ def test_a_map_that_teaches_keeps_quiet_about_the_frames_that_judge(start, seque
     options = {"map": sequences / "slam", "light": "gamma=2,mu=1", "keep_worse": True, "held_out": 0.3, "steps": 3}
     taught = adapted(start, sequences / "unlit", tmp_path / "taught", points=5.0, overlap=1.0, **options)
     alone = adapted(start, sequences / "unlit", tmp_path / "alone", points=0.0, **options)
+    assert (taught["anchor"], alone["anchor"]) == (2.5, 20)  # a map sees what the loss does at its points alone
     assert taught["before"]["loss"] == alone["before"]["loss"] and taught["after"]["loss"] != alone["after"]["loss"]
     log = (tmp_path / "taught" / "log.txt").read_text()
     assert (

@@ -3,7 +3,7 @@ without a map: what was said and written, beside the true AbsRel of all frames, 
 
 Homes: 30 frames of 192x160 over 24 mm of a realistic colon, a plain one, a hollow that is none and a colon of another
 make, each through another lens, the light known. With a map: that of a simulated SLAM. Without: made by the program.
-Each also with the loss as the only teacher, which is what misleads, and with nothing that judges. LIGHTDEPTH_BENCH
+Each also with the loss as the only teacher, held near the start and not, and with nothing that judges. LIGHTDEPTH_BENCH
 names a folder to keep what was made in.
 """
 
@@ -47,9 +47,11 @@ WAYS = {
     "given map": {"map": True},
     "made map": {},
     "given map, loss alone": {"map": True, "points": 0.0},
-    "made map, loss alone": {"points": 0.0},
     "no judge": {"judge": "none"},
+    "given map, loss alone, not held": {"map": True, "points": 0.0, "anchor": 0.0},
 }
+AT_OWN_RISK = "given map, loss alone, not held"
+"""Shown and not asserted: what the loss does away from the map's points, the map cannot see."""
 
 
 def home_frames(kind: str) -> list[Frame]:
@@ -94,4 +96,4 @@ def test_what_is_written_is_not_worse_and_what_is_called_better_was_judged(kind,
             flush=True,
         )
         assert record["better"] <= (record["criterion"] in ("truth", "map"))
-        assert not accepted or change <= 0.02
+        assert not accepted or change <= 0.02 or way == AT_OWN_RISK

@@ -10,7 +10,7 @@ from lightdepth.errors import InputError
 from .module import What
 
 HOLD = 20.0
-"""Weight of the anchor where nothing judges."""
+"""Weight of the anchor where the loss is the only teacher: a map sees what it does at its points alone."""
 POINTS = 100.0
 """Weight of a map's points where none is given: the light's loss, whose weights are about 1, has little say then."""
 
@@ -35,7 +35,7 @@ class AdaptConfig:
     """Number of ranks of what low_rank adds to every convolution. More let it change further."""
     anchor: float | None = None
     """Weight that holds the shape of each distance map to what the checkpoint said before; left out, half of that of
-    the map's points, and 20 where nothing judges. A larger one holds it more firmly."""
+    the map's points; where none teach, 0 under true distance and else 20. A larger one holds it more firmly."""
     replay: int = 0
     """Number of synthetic colons of the kind that the checkpoint learned from, which fill half of each batch; 0 for
     none. More show more variety and take longer to render."""
@@ -72,11 +72,13 @@ class AdaptConfig:
         """The weight of a map's points, by whether there is a map."""
         return (POINTS if self.points is None else self.points) if has_map else 0.0
 
-    def held_on(self, has_map: bool, judged: bool) -> float:
-        """The weight of the anchor, by whether there is a map and whether anything judges."""
+    def held_on(self, points: float, by_truth: bool) -> float:
+        """The weight of the anchor, by the weight of the points that teach and by whether truth judges."""
         if self.anchor is not None:
             return self.anchor
-        return self.taught_by(has_map) / 2 if judged else HOLD
+        if points:
+            return points / 2
+        return 0.0 if by_truth else HOLD
 
     @property
     def taught(self) -> bool:

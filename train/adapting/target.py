@@ -150,10 +150,11 @@ def adaptation(
     start: NetworkModel,
     loss: LossConfig,
     wall: WallJudge | None,
+    by_truth: bool,
     config: AdaptConfig,
     size: tuple[int, int],
 ) -> Adaptation:
-    """The start, as a module that goes on learning from the target; the blocks of `wall` judge."""
+    """The start, as a module that goes on learning from the target; true distance or the blocks of `wall` judge."""
     weights = {"points": config.taught_by(target.sparse_map is not None), "overlap": config.overlap}
     teacher = None
     if target.sparse_map is not None and wall is not None and wall.taught:
@@ -163,7 +164,7 @@ def adaptation(
             if config.taught:
                 raise
             run.log(f"the map teaches nothing: {error}")
-    anchor = config.held_on(target.sparse_map is not None, not target.unjudged)
+    anchor = config.held_on(0.0 if target.unjudged else weights["points"], by_truth)
     if target.unjudged:
         run.log(f"nothing but the loss can judge, {target.unjudged}: held to {start.name} by an anchor of {anchor:g}")
     return Adaptation(

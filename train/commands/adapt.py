@@ -93,7 +93,7 @@ def adapt(
         closed = looked_at(DeclineModel(details=False), target.held, wall)
         if closed.truth is None and closed.wall is not None and compared(closed.wall, closed.wall) is None:
             target = replace(target, unjudged="the map has too few points to judge")
-        module = adaptation(run, target, start, loss, wall, config, size)
+        module = adaptation(run, target, start, loss, wall, closed.truth is not None, config, size)
 
         pictures = Pictures(target)
         pictures.add(start)
