@@ -187,8 +187,8 @@ def test_a_map_calls_better_only_what_its_blocks_agree_on():
 
 
 def test_a_network_that_became_inconsistent_is_not_accepted():
-    by_map = verdict(judgement(None, wall(0.2)), judgement(None, wall(0.1), inconsistency=0.21), "")
-    assert by_map.word == "not better" and "2.1 times the start's" in str(by_map)
+    by_map = verdict(judgement(None, wall(0.2)), judgement(None, wall(0.1), inconsistency=0.31), "")
+    assert by_map.word == "not better" and "3.1 times the start's" in str(by_map)
     by_nothing = verdict(judgement(), judgement(inconsistency=0.13), "nobody looked")
     assert by_nothing.word == "not judged" and not by_nothing.accepted and "not accepted" in str(by_nothing)
     assert not verdict(judgement(), judgement(inconsistency=float("nan")), "nobody looked").accepted

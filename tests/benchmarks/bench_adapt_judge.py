@@ -36,13 +36,13 @@ adapt = by_options(adapt_verb)
 
 SIZE, COUNT, TRAVEL, STEPS = (192, 160), 30, 24.0, 60
 HOMES = {
-    "realistic": (9300, "c3vd"),
-    "plain": (9301, "fisheye"),
-    "hollow": (9302, "pinhole"),
-    "variant": (9303, "c3vd"),
+    "realistic": (9400, "pinhole"),
+    "plain": (9401, "c3vd"),
+    "hollow": (9402, "fisheye"),
+    "variant": (9403, "fisheye"),
 }
 KINDS = {"realistic": realistic, "plain": TubeConfig, "hollow": cavity}
-SLAM = SlamConfig(keyframe_every=1, maps=1, points_per_keyframe=60, spurious=0.05)
+SLAM = SlamConfig(keyframe_every=1, maps=1)
 WAYS = {
     "given map": {"map": True},
     "made map": {},

@@ -29,7 +29,7 @@ from .wall_judge import WallErrors, WallJudge, compared
 Criterion = Literal["truth", "map", "none"]
 Word = Literal["better", "not better", "worse", "not judged"]
 
-MOST_INCONSISTENT = 2.0
+MOST_INCONSISTENT = 3.0
 """Times the start's inconsistency, above which an adapted network is not accepted, whatever the map says."""
 MOST_INCONSISTENT_UNJUDGED = 1.25
 """The same where nothing judged."""
