@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from densify.config import MethodConfig
 from densify.placing import Placing
@@ -20,11 +17,9 @@ from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
 from lightdepth.maps import read_map
 from lightdepth.models import ConstantModel, DepthModel
-from lightdepth.reporting.report import number
-from lightdepth.reporting.run import Run, plain
+from lightdepth.reporting.run import Run
 from lightdepth.sfm.config import SfmConfig
-from lightdepth.sfm.reconstruction import sparse_map_from_frames
-from lightdepth.sfm.unmapped import summary
+from lightdepth.sfm.made import made_sparse
 from lightdepth.sparse_map import Keyframe, SparseMap
 
 
@@ -62,33 +57,6 @@ def check_unit(mm_per_unit: float | None) -> None:
     """Raises InputError for millimetres per map unit that cannot be."""
     if mm_per_unit is not None and not mm_per_unit > 0:
         raise InputError("--mm-per-unit", f"{mm_per_unit}", "expected a positive number of millimetres")
-
-
-def made_sparse(
-    run: Run, frames: FrameSequence, config: SfmConfig, poses: Mapping[int, np.ndarray] | None = None
-) -> SparseMap:
-    """A map by pycolmap, written to sparse/ in the run folder; `poses` (4, 4) by frame number, where they are known."""
-    stages: list[str] = []
-
-    def show(stage: str, done: int, count: int) -> None:
-        if stage not in stages:
-            stages.append(stage)
-            run.log(f"sparse map: {stage}")
-
-    found = sparse_map_from_frames(frames, run.folder / "sparse", config, show, poses)
-    for submap in found.submaps:
-        errors = number(float(np.median(submap.reprojection_errors())))
-        run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
-    if found.poses is not None:
-        run.log(f"known poses: {found.poses}")
-        run.record["known_poses"] = plain(found.poses)
-    if found.failed:
-        reasons = summary(list(found.failed.values()))
-        run.log(f"{len(found.failed)} of {len(frames)} frames found no place: {reasons}")
-        for name, reason in found.failed.items():
-            run.log(f"  {name}: {reason}")
-    run.record["unregistered"] = found.failed
-    return found
 
 
 def fitted_light(

@@ -11,7 +11,7 @@ from verbs import by_options
 
 from lightdepth.checkpoint import load_model, read_card, save_model
 from lightdepth.datasets import write_folder
-from lightdepth.errors import PartialFailure
+from lightdepth.errors import InputError, PartialFailure
 from lightdepth.frame import to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.maps import write_multimap
@@ -19,8 +19,9 @@ from lightdepth.models import NetworkModel
 from lightdepth.network import NetworkConfig, build_network
 from lightdepth.photometry import PhotometricCalibration
 from train.adapting.card import source_colons, target_loss
-from train.adapting.judging import Judgement, Verdict, verdict
+from train.adapting.judging import Judgement, verdict
 from train.adapting.module import Adaptation, anchor_loss, let_learn, merge_low_rank
+from train.adapting.wall_judge import PointError, WallErrors
 from train.colons import TubeData
 from train.commands.adapt import adapt as adapt_verb
 from train.datamodule import FrameData, FrameDataModule, collate
@@ -74,18 +75,60 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
     return {name: value.cpu() for name, value in model.network.state_dict().items()}
 
 
-def test_unlabelled_frames_lower_the_loss_on_frames_that_were_never_trained_on(start, sequences, tmp_path):
-    record = adapted(start, sequences / "plain", tmp_path / "run", steps=16)
-    assert record["criterion"] == "label_free" and record["better"] and record["written"]
-    assert record["after"]["loss"] < 0.95 * record["before"]["loss"]
-    assert record["frames"] == {"train": 8, "val": 2} and "abs_rel_median" not in record["before"]
+def test_without_a_judge_the_network_is_held_near_its_start_and_called_not_judged(start, sequences, tmp_path):
+    record = adapted(start, sequences / "plain", tmp_path / "run", steps=16, judge="none")
+    assert record["criterion"] == "none" and record["word"] == "not judged" and not record["better"]
+    assert record["anchor"] == 20 and record["written"]
+    assert record["after"]["loss"] < record["before"]["loss"]
+    assert record["frames"] == {"train": 8, "val": 2} and record["before"]["truth"] is None
     assert {p.name for p in (tmp_path / "run").iterdir()} == {
         *("config.yaml", "log.txt", "light.json", "model.safetensors", "model.md", "report.html", "run.json")
     }
     card = read_card(tmp_path / "run" / "model.safetensors")
     assert card["adapted_from"] == "start" and card["rows"] == SIZE[1]
-    assert "can fall while distance gets worse" in (tmp_path / "run" / "report.html").read_text()
+    for name in ("report.html", "log.txt", "model.md", "run.json"):
+        said = (tmp_path / "run" / name).read_text()
+        assert "Not judged" in said and "better or equal" not in said, name
     assert load_model(tmp_path / "run" / "model.safetensors")(colon(count=10).frames[0]).distance.shape == (80, 96)
+
+
+def test_where_no_map_can_be_made_nothing_judges_and_the_reason_is_said(start, sequences, tmp_path, monkeypatch):
+    def fails(*_):
+        raise InputError("the frames", "no sparse map could be made", "more frames")
+
+    monkeypatch.setattr("train.adapting.target.made_sparse", fails)
+    record = adapted(start, sequences / "plain", tmp_path / "run", steps=2)
+    assert record["word"] == "not judged" and "no map could be made of the frames" in record["verdict"]
+    with refused(found="no sparse map could be made"):
+        adapted(start, sequences / "plain", tmp_path / "taught", points=1.0)
+
+
+def test_a_map_is_made_to_judge_frames_that_have_neither_truth_nor_map(start, sequences, tmp_path, monkeypatch):
+    found = slam(colon(count=10).frames).map
+    monkeypatch.setattr("train.adapting.target.made_sparse", lambda *_: found)
+    record = adapted(start, sequences / "plain", tmp_path / "run", steps=2, keep_worse=True)
+    assert record["criterion"] == "map" and record["word"] != "not judged" and record["anchor"] == 50
+    by_truth = adapted(start, sequences / "truth", tmp_path / "true", steps=2, keep_worse=True)
+    assert by_truth["criterion"] == "truth" and by_truth["anchor"] == 0
+
+
+def test_a_map_that_is_too_poor_to_judge_lets_the_network_be_held_near_its_start(start, sequences, tmp_path):
+    whole = slam(colon(count=10).frames).map
+    first = whole.submaps[0]
+    few = replace(first, point_ids=first.point_ids[:12], points=first.points[:12])
+    write_multimap(replace(whole, submaps=(few,)), tmp_path / "slam")
+    record = adapted(start, sequences / "plain", tmp_path / "run", map=tmp_path / "slam", steps=2)
+    assert record["word"] == "not judged" and record["anchor"] == 20 and "too few points" in record["verdict"]
+    assert "the map teaches nothing" in (tmp_path / "run" / "log.txt").read_text()
+
+
+@pytest.mark.parametrize(("value", "said"), [(0.0, "100% of the frames are black"), (1.0, "100% white")])
+def test_frames_that_show_nothing_are_refused(start, tmp_path, value, said):
+    frames = colon(count=6).frames
+    empty = [replace(f, image=np.full_like(f.image, value), true_distance=None) for f in frames]
+    write_folder(empty, tmp_path / "data")
+    with refused(found=said, cure="lit tissue"):
+        adapted(start, tmp_path / "data", tmp_path / "run")
 
 
 def test_a_network_that_got_worse_is_not_written_unless_asked_for(start, sequences, tmp_path, monkeypatch):
@@ -97,7 +140,7 @@ def test_a_network_that_got_worse_is_not_written_unless_asked_for(start, sequenc
 
     monkeypatch.setattr(Adaptation, "batch_loss", astray)
     run = tmp_path / "run"
-    with pytest.raises(PartialFailure, match=r"model\.safetensors: not written, the adapted network got worse"):
+    with pytest.raises(PartialFailure, match=r"model\.safetensors: not written, nothing better than start was found"):
         adapted(start, sequences / "truth", run)
     record = json.loads((run / "run.json").read_text())
     assert record["criterion"] == "truth" and not record["better"] and not record["written"]
@@ -106,14 +149,49 @@ def test_a_network_that_got_worse_is_not_written_unless_asked_for(start, sequenc
     assert not kept["better"] and kept["written"] and (run / "model.safetensors").is_file()
 
 
-def test_truth_judges_before_the_map_and_the_map_before_the_loss():
-    def judgement(abs_rel, at_points, loss):
-        return Judgement({"loss": loss, **({} if abs_rel is None else {"abs_rel_median": abs_rel})}, at_points)
+def wall(error: float, spread: float = 0.0, frames: float | None = None, count: int = 20) -> WallErrors:
+    """Points, one to a block, whose errors are `error`, every other one larger and smaller by `spread`."""
+    points = {(0, i): PointError(i, error + spread * (-1) ** i, 1.0) for i in range(count)}
+    return WallErrors(points, {} if frames is None else {7: frames})
 
-    assert verdict(judgement(0.1, 0.2, 3.0), judgement(0.2, 0.1, 2.0)) == Verdict("truth", 0.1, 0.2)
-    assert verdict(judgement(None, 0.2, 3.0), judgement(None, 0.3, 2.0)) == Verdict("map", 0.2, 0.3)
-    assert verdict(judgement(None, None, 3.0), judgement(None, None, 2.0)).better
-    assert not Verdict("map", 0.2, float("nan")).better and not Verdict("truth", 0.1, 0.2).better
+
+def judgement(truth=None, at_wall=None, loss=1.0, inconsistency=0.1) -> Judgement:
+    return Judgement({"loss": loss, "inconsistency": inconsistency}, truth, at_wall)
+
+
+def test_truth_judges_before_the_map_and_the_loss_judges_nothing():
+    by_truth = verdict(judgement(0.1, wall(0.2)), judgement(0.2, wall(0.1)), "")
+    assert (by_truth.criterion, by_truth.word, by_truth.accepted) == ("truth", "worse", False)
+    assert str(by_truth).endswith("0.1 -> 0.2 (+100.0 %): worse")
+    by_map = verdict(judgement(None, wall(0.2), 3.0), judgement(None, wall(0.1), 4.0), "")
+    assert (by_map.criterion, by_map.word, by_map.accepted) == ("map", "better", True)
+    by_nothing = verdict(judgement(loss=3.0), judgement(loss=1.0), "nobody looked")
+    assert (by_nothing.criterion, by_nothing.word, by_nothing.better) == ("none", "not judged", False)
+    assert str(by_nothing).startswith("Not judged: nobody looked.") and by_nothing.accepted
+    assert not verdict(judgement(0.1), judgement(float("nan")), "").accepted
+    assert "nan" not in str(verdict(judgement(0.0), judgement(0.0), ""))
+
+
+def test_a_map_calls_better_only_what_its_blocks_agree_on():
+    start = judgement(None, wall(0.2, frames=0.2))
+    for after, word in (
+        (wall(0.19, frames=0.2), "better"),
+        (wall(0.19, 0.15, frames=0.2), "not better"),  # chance does as well
+        (wall(0.21, frames=0.2), "worse"),
+        (wall(0.19, frames=0.21), "not better"),  # held-out frames say no
+    ):
+        found = verdict(start, judgement(None, after), "")
+        assert found.word == word and found.accepted == (word == "better"), str(found)
+    few = verdict(judgement(None, wall(0.2, count=4)), judgement(None, wall(0.1, count=4)), "")
+    assert few.word == "not judged" and "too few points" in str(few)
+
+
+def test_a_network_that_became_inconsistent_is_not_accepted():
+    by_map = verdict(judgement(None, wall(0.2)), judgement(None, wall(0.1), inconsistency=0.31), "")
+    assert by_map.word == "not better" and "3.1 times the start's" in str(by_map)
+    by_nothing = verdict(judgement(), judgement(inconsistency=0.13), "nobody looked")
+    assert by_nothing.word == "not judged" and not by_nothing.accepted and "not accepted" in str(by_nothing)
+    assert not verdict(judgement(), judgement(inconsistency=float("nan")), "nobody looked").accepted
 
 
 def test_a_map_finds_the_light_that_nobody_gave_and_its_points_judge(start, sequences, tmp_path):
@@ -206,7 +284,9 @@ def test_low_rank_additions_end_as_plain_weights_that_compute_the_same():
 
 
 def test_an_exported_low_rank_model_is_a_plain_checkpoint(start, sequences, tmp_path):
-    adapted(start, sequences / "plain", tmp_path / "run", what="low_rank", rank=1, steps=2, keep_worse=True)
+    adapted(
+        start, sequences / "plain", tmp_path / "run", judge="none", what="low_rank", rank=1, steps=2, keep_worse=True
+    )
     before, after = weights(start), weights(tmp_path / "run" / "model.safetensors")
     assert before.keys() == after.keys()
     changed = {name for name in before if not torch.equal(before[name], after[name])}
@@ -273,7 +353,9 @@ def test_the_target_s_truth_is_never_looked_at_and_the_replayed_colons_is(replay
 
 
 def test_a_run_with_replay_and_anchor_uses_colons_of_the_start_s_kind(start, sequences, tmp_path):
-    record = adapted(start, sequences / "plain", tmp_path / "run", replay=1, anchor=0.5, keep_worse=True, steps=3)
+    record = adapted(
+        start, sequences / "plain", tmp_path / "run", judge="none", replay=1, anchor=0.5, keep_worse=True, steps=3
+    )
     assert record["frames"]["train"] == 8 + 2
     assert read_card(tmp_path / "run" / "model.safetensors")["replayed"]["lenses"] == ["pinhole"]
     assert source_colons(read_card(start), 3) == TubeData(3, frames=2, lenses=("pinhole",), mu=(0.0, 0.5))
@@ -315,8 +397,9 @@ def test_what_cannot_be_used_is_said_and_nothing_is_left_behind(start, sequences
 def test_a_map_that_teaches_keeps_quiet_about_the_frames_that_judge(start, sequences, tmp_path):
     options = {"map": sequences / "slam", "light": "gamma=2,mu=1", "keep_worse": True, "held_out": 0.3, "steps": 3}
     taught = adapted(start, sequences / "unlit", tmp_path / "taught", points=5.0, overlap=1.0, **options)
-    alone = adapted(start, sequences / "unlit", tmp_path / "alone", **options)
-    assert taught["before"] == alone["before"] and taught["after"]["map"] != alone["after"]["map"]
+    alone = adapted(start, sequences / "unlit", tmp_path / "alone", points=0.0, **options)
+    assert (taught["anchor"], alone["anchor"]) == (2.5, 20)  # a map sees what the loss does at its points alone
+    assert taught["before"]["loss"] == alone["before"]["loss"] and taught["after"]["loss"] != alone["after"]["loss"]
     log = (tmp_path / "taught" / "log.txt").read_text()
     assert (
         "the map teaches: 7 keyframes" in log and "the map teaches" not in (tmp_path / "alone" / "log.txt").read_text()
@@ -324,8 +407,6 @@ def test_a_map_that_teaches_keeps_quiet_about_the_frames_that_judge(start, seque
     assert "5 (points), 1 (overlap)" in (tmp_path / "taught" / "report.html").read_text()
 
 
-def test_a_map_cannot_teach_what_it_has_to_judge(start, sequences, tmp_path):
-    with refused(found="too few of its keyframes are held-out frames", cure="raise --held-out"):
-        adapted(start, sequences / "unlit", tmp_path / "run", map=sequences / "slam", points=1.0)
-    with refused(where="--points, --overlap", found="1.0, 0.0 without --map"):
-        adapted(start, sequences / "unlit", tmp_path / "run", points=1.0)
+def test_a_map_does_not_teach_where_none_may_be_made(start, sequences, tmp_path):
+    with refused(where="--points, --overlap", found="1.0, 0.0 without --map and with --judge none"):
+        adapted(start, sequences / "unlit", tmp_path / "run", points=1.0, judge="none")

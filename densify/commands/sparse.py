@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.inputs import made_sparse
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.made import made_sparse
 
 
 def sparse(

@@ -2,11 +2,11 @@
 
     pytest tests/benchmarks/bench_verdict.py -o python_files='bench_*.py' -o addopts= -s
 
-Forty runs on colons 910-915 (lenses c3vd, fisheye, pinhole in turn, every second colon of the realistic family), none of
-which anything was tuned on: 100 frames of 160x128 over 30 mm, one submap of a simulated SLAM that errs as a real one
-(lightdepth.tube.slam), with the closed form or a bundled network. What is green, amber and red in truth was fixed before
-the first run: with e the median of |surface - truth| / truth along the rays of the keyframes, e_1 that of the same with
-one scale a keyframe,
+Forty runs on colons 910-915 (lenses c3vd, fisheye, pinhole in turn, every second colon of the realistic family), none
+of which anything was tuned on: 100 frames of 160x128 over 30 mm, one submap of a simulated SLAM that errs as a real one
+(lightdepth.tube.slam), with the closed form or a bundled network. What is green, amber and red in truth was fixed
+before the first run: with e the median of |surface - truth| / truth along the rays of the keyframes, e_1 that of the
+same with one scale a keyframe,
 
     green: e <= 5 % and e <= 1.2 e_1      red: e > 10 % or e > 1.5 e_1      amber: what is between.
 
@@ -43,6 +43,9 @@ UNBRAKED = replace(FULL, judge=JudgeConfig(on=False))
 SELF, CLOSED = "lightdepth-self", "decline"
 
 
+NO_ERRORS = MapErrors()
+
+
 @dataclass(frozen=True)
 class Case:
     """One run: a colon (its place in SCENES), a depth model, and what is wrong."""
@@ -50,7 +53,7 @@ class Case:
     scene: int
     model: str
     name: str
-    errors: MapErrors = MapErrors()
+    errors: MapErrors = NO_ERRORS
     few: bool = False
     independent: bool = False
     white: bool = False
@@ -59,7 +62,7 @@ class Case:
 
     @property
     def coherent(self) -> bool:
-        return self.errors != MapErrors()
+        return self.errors != NO_ERRORS
 
 
 def side(share: float, factor: float) -> MapErrors:
@@ -212,7 +215,8 @@ def test_the_verdict_and_the_number_order_runs_as_truth_does():
         f"{sum(r.colour == 'green' for r in red)} of {len(red)}. Green called red: "
         f"{sum(r.colour == 'red' for r in green)} of {len(green)}.",
         f"Full at most 1.05 of one scale's RMS where errors come together: {sum(w <= 1.05 for w in worse)} of "
-        f"{len(worse)} (without the brake {sum(b <= 1.05 for b in before)}); worst {max(worse):.2f} ({max(before):.2f}).",
+        f"{len(worse)} (without the brake {sum(b <= 1.05 for b in before)}); "
+        f"worst {max(worse):.2f} ({max(before):.2f}).",
     ]
     page = ["# The verdict against truth", "", (__doc__ or "").split("\n\n")[2].strip(), "", *(f"{s}\n" for s in said)]
     page += [*table(rows), "", "Drift of scale, which no image can see:", "", *table(apart)]

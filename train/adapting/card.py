@@ -32,6 +32,10 @@ class AdaptedCard(Card):
     verdict: Verdict
     """start and adapted network side by side"""
 
+    def text(self, name: str) -> str:
+        title, rest = super().text(name).split("\n", 1)
+        return f"{title}\n\n{self.verdict}.\n{rest}"
+
     def record(self) -> dict[str, object]:
         shared = super().record()
         said, errors, version = shared.pop("trained_on"), shared.pop("errors"), shared.pop("version")

@@ -13,8 +13,9 @@ w are Geman-McClure's of the residual in robust deviations: wrong points and hid
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -61,18 +62,25 @@ class Lesson:
 class MapTeacher:
     """Lessons from the keyframes of a map whose frames are in `frames`.
 
-    Points that any of the keyframes numbered `withheld` observed are never shown, so that they can judge.
+    Points that any of the keyframes numbered `withheld` observed, and those with the ids `hidden` by submap id, are
+    never shown, so that they can judge.
     """
 
     def __init__(
-        self, frames: FrameSequence, sparse_map: SparseMap, size: tuple[int, int], withheld: Iterable[int], seed: int
+        self,
+        frames: FrameSequence,
+        sparse_map: SparseMap,
+        size: tuple[int, int],
+        withheld: Iterable[int],
+        seed: int,
+        hidden: Mapping[int, np.ndarray] = MappingProxyType({}),
     ) -> None:
         self._frames, self._size, self._seed = frames, size, seed
-        self.keyframes = _taught(frames, sparse_map, set(withheld))
+        self.keyframes = _taught(frames, sparse_map, set(withheld), hidden)
         if not self.keyframes:
             raise InputError(
                 sparse_map.source,
-                f"no keyframe to learn from has {LEAST_POINTS} points that no withheld keyframe saw",
+                f"no keyframe to learn from has {LEAST_POINTS} points that do not judge",
                 "give more frames, or a smaller --held-out",
             )
 
@@ -86,19 +94,21 @@ class MapTeacher:
         return Lesson(tuple(chosen), collate([to_batch(self._frames[k.frame], self._size) for k in chosen]))
 
 
-def _taught(frames: FrameSequence, sparse_map: SparseMap, withheld: set[int]) -> list[TaughtKeyframe]:
+def _taught(
+    frames: FrameSequence, sparse_map: SparseMap, withheld: set[int], hidden: Mapping[int, np.ndarray]
+) -> list[TaughtKeyframe]:
     camera = frames[0].camera
     rows = {number: row for row, number in enumerate(frames.numbers)}
     found: list[TaughtKeyframe] = []
     for submap in sparse_map.submaps:
         judged = [submap.observed_points(k)[0] for k in submap.keyframes if k.number in withheld]
-        hidden = np.unique(np.concatenate(judged)) if judged else np.zeros(0, int)
+        judging = np.unique(np.concatenate([*judged, hidden.get(submap.id, np.zeros(0, int))]))
         taught: dict[int, TaughtKeyframe] = {}
         for index, keyframe in enumerate(submap.keyframes):
             if keyframe.number not in rows or keyframe.number in withheld:
                 continue
             ids, points, _ = submap.observed_points(keyframe)
-            points = keyframe.in_camera(points[~np.isin(ids, hidden)])
+            points = keyframe.in_camera(points[~np.isin(ids, judging)])
             pixels, seen = camera.project(points)
             distances = np.linalg.norm(points, axis=1)
             use = seen & (distances > 0)

@@ -51,31 +51,20 @@ def page(
 ) -> Report:
     """What was adapted and what it came to; `fitted` says what was found where the light was fitted on the map."""
     page = Report(f"{start.name} adapted to {target.source.data}")
-    kept = (
-        "The model was written."
-        if outcome.written
-        else "The model got worse, so none was written; --keep-worse writes it."
-    )
-    page.text(f"{outcome.verdict}. {kept}")
-    if outcome.verdict.criterion == "label_free":
-        page.text(
-            "Neither truth nor a map was there to judge by: the loss says how well the light explains the images, not "
-            "how right the distance is. It can fall while distance gets worse; a sparse map (--map) tells."
-        )
+    page.text(f"{outcome.verdict}. {outcome.kept(start.name)}.")
     page.text(f"Light of the frames: {light_text(target.light)}." + (f" Light {fitted}." if fitted else ""))
     page.heading(f"Before and after, on {held} frames that were held out")
     headers = ["model"]
     columns: list[list[float | None]] = []
     before, after = outcome.before, outcome.after
-    if "abs_rel_median" in before.errors:
-        titles = {"abs_rel": "AbsRel", "rmse_mm": "RMSE mm", "medae_mm": "MedAE mm", "delta1": "share within 1.25"}
-        for name, title in titles.items():
-            headers.append(f"{title} (median-aligned)")
-            keys = (f"closed_form/{name}_median", f"{name}_median", f"{name}_median")
-            columns.append([e.errors[key] for e, key in zip((before, before, after), keys, strict=True)])
-    if before.at_points is not None:
-        headers.append("median error at the map's points")
-        columns.append([outcome.closed_form_at_points, before.at_points, after.at_points])
+    three = (outcome.closed_form, before, after)
+    for title, found in (
+        ("AbsRel (median-aligned)", [judgement.truth for judgement in three]),
+        ("median error at the map's judging points", [judgement.at_wall for judgement in three]),
+    ):
+        if found[1] is not None:
+            headers.append(title)
+            columns.append(found)
     for name, title in (("loss", "self-supervised loss"), ("inconsistency", "inconsistency")):
         headers.append(title)
         columns.append([None, before.errors[name], after.errors[name]])

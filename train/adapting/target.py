@@ -14,20 +14,24 @@ from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.detective import PairingConfig, check_pairing
 from lightdepth.errors import InputError
 from lightdepth.light.fit_on_map import fit_assumed_light
-from lightdepth.light.views import LightView, with_light
+from lightdepth.light.views import with_light
 from lightdepth.losses import LossConfig
 from lightdepth.maps import read_map
 from lightdepth.models import NetworkModel
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.reporting.run import Run
+from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.made import made_sparse
 from lightdepth.sparse_map import SparseMap
 
 from ..datamodule import FrameData, FrameDataModule
 from .card import source_colons
 from .config import AdaptConfig
-from .judging import LEAST_VIEWS, parted
+from .exposure import check_exposed
+from .judging import parted
 from .map_teacher import MapTeacher
 from .module import Adaptation
+from .wall_judge import WallJudge
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +47,9 @@ class Target:
     held: FrameSequence
     """the frames at its end, which judge and are never learned from"""
     sparse_map: SparseMap | None
-    """a map of it, where one was given"""
+    """a map of it, where one was given or made"""
+    unjudged: str
+    """why nothing but the loss judges, where that is so; else nothing"""
 
     @property
     def light(self) -> PhotometricCalibration:
@@ -55,30 +61,53 @@ def read_target(
     source: SequenceSource,
     map: Path | None,
     fit_light: bool,
-    held_out: float,
+    config: AdaptConfig,
     start: NetworkModel,
+    sfm: SfmConfig,
     pairing: PairingConfig = PairingConfig(),
 ) -> Target:
-    """The frames and their map. Where nobody gave a light, the map's points may tell it; what was used is written."""
-    sparse_map = read_map(map) if map is not None else None
+    """The frames and their map, given or made. Where nobody gave a light, the map's points may tell it; what was used
+    is written."""
+    sparse_map, unjudged = read_map(map) if map is not None else None, ""
     map_camera = sparse_map.submaps[0].keyframes[0].camera if sparse_map is not None else None
     frames = source.open(map_camera)
     run.hash_inputs(**source.files, map=map)
-    training, held = parted(frames, held_out)
+    training, held = parted(frames, config.held_out)
+    check_exposed((training, held))
     if sparse_map is not None:
         check_shared_frames(sparse_map, frames)
         check_pairing(sparse_map, frames, pairing, run, frames[0].camera if source.camera is not None else None)
         write_camera(frames[0].camera, run.folder / "camera.json")
         # The map's camera, where the folder has none: for all sequences.
         source = replace(source, camera=run.folder / "camera.json")
-        if source.light is None and fit_light:
-            fitted = fit_assumed_light(run, training, sparse_map, start)
-            if fitted is not None:
-                frames, training, held = (with_light(part, fitted) for part in (frames, training, held))
-                source = replace(source, light=str(run.folder / "light.json"))
+    else:
+        sparse_map, unjudged = _made(run, frames, held, config, sfm)
+    if sparse_map is not None and source.light is None and fit_light:
+        fitted = fit_assumed_light(run, training, sparse_map, start)
+        if fitted is not None:
+            frames, training, held = (with_light(part, fitted) for part in (frames, training, held))
+            source = replace(source, light=str(run.folder / "light.json"))
     write_light(frames[0].light, run.folder / "light.json")
     run.log(f"light of {source.data}: {light_text(frames[0].light)}")
-    return Target(source, frames, training, held, sparse_map)
+    return Target(source, frames, training, held, sparse_map, unjudged)
+
+
+def _made(
+    run: Run, frames: FrameSequence, held: FrameSequence, config: AdaptConfig, sfm: SfmConfig
+) -> tuple[SparseMap | None, str]:
+    """A map made to judge or to teach, where one is needed, and why nothing judges, where that is so."""
+    has_truth = any(frame.true_distance is not None and (frame.true_distance > 0).any() for frame in held)
+    if has_truth and not config.taught:
+        return None, ""
+    if config.judge == "none":
+        return None, "" if has_truth else "there is neither truth nor a map, and --judge none makes no map"
+    try:
+        return made_sparse(run, frames, sfm), ""
+    except InputError as error:
+        if config.taught:
+            raise
+        run.log(f"no map could be made to judge by: {error}")
+        return None, "there is no truth, and no map could be made of the frames"
 
 
 def light_text(light: PhotometricCalibration) -> str:
@@ -124,41 +153,44 @@ def adaptation(
     target: Target,
     start: NetworkModel,
     loss: LossConfig,
-    views: Sequence[LightView],
+    wall: WallJudge | None,
+    by_truth: bool,
     config: AdaptConfig,
     size: tuple[int, int],
 ) -> Adaptation:
-    """The start, as a module that goes on learning from the target; `views` of its map judge."""
+    """The start, as a module that goes on learning from the target; true distance or the blocks of `wall` judge."""
+    weights = {"points": config.taught_by(target.sparse_map is not None), "overlap": config.overlap}
     teacher = None
-    if target.sparse_map is not None and config.taught:
-        teacher = _teacher(run, target, target.sparse_map, views, size, config.seed)
+    if target.sparse_map is not None and wall is not None and wall.taught:
+        try:
+            teacher = _teacher(run, target, target.sparse_map, wall, size, config.seed)
+        except InputError as error:
+            if config.taught:
+                raise
+            run.log(f"the map teaches nothing: {error}")
+    anchor = config.held_on(0.0 if target.unjudged else weights["points"], by_truth)
+    if target.unjudged:
+        run.log(f"nothing but the loss can judge, {target.unjudged}: held to {start.name} by an anchor of {anchor:g}")
     return Adaptation(
         start,
         loss,
         config.learning_rate,
         size[1],
-        config.anchor,
+        anchor,
         config.replay > 0,
         config.what,
         config.rank,
         torch.Generator().manual_seed(config.seed),
         teacher,
-        {"points": config.points, "overlap": config.overlap},
+        weights,
     )
 
 
 def _teacher(
-    run: Run, target: Target, sparse_map: SparseMap, views: Sequence[LightView], size: tuple[int, int], seed: int
+    run: Run, target: Target, sparse_map: SparseMap, wall: WallJudge, size: tuple[int, int], seed: int
 ) -> MapTeacher:
     """The map as a teacher that keeps quiet about what judges."""
-    judges = {view.keyframe.number for view in views}
-    if not judges <= set(target.held.numbers):
-        raise InputError(
-            sparse_map.source,
-            "too few of its keyframes are held-out frames to judge what the others teach",
-            f"{LEAST_VIEWS} are needed: raise --held-out, or leave --points and --overlap at 0",
-        )
-    teacher = MapTeacher(target.training, sparse_map, size, target.held.numbers, seed)
+    teacher = MapTeacher(target.training, sparse_map, size, target.held.numbers, seed, wall.hidden())
     known = sum(len(k.distances) for k in teacher.keyframes)
     paired = sum(bool(k.partners) for k in teacher.keyframes)
     run.log(f"the map teaches: {len(teacher.keyframes)} keyframes, {known} observed points, {paired} with partners")

@@ -1,15 +1,16 @@
 """`lightdepth adapt`: a checkpoint that knows another endoscope or organ, from unlabelled frames of it.
 
-RUN/  config.yaml  log.txt  light.json (the light that was used)  report.html  model.safetensors  model.md  run.json
+RUN/  config.yaml  log.txt  light.json (the light that was used)  sparse/ (a map made to judge by)  report.html
+      model.safetensors  model.md  run.json
 
-Start and adapted network are judged on the end of each sequence, which is never trained on, by the most trustworthy of
-three: true distance; those of the map's points that no training sees; the loss, which needs neither. Where the adapted
-network is the worse one, no model is written.
+Start and adapted network are judged on the end of each sequence, which is never trained on: by true distance or,
+without that, at blocks of wall of a map, given or made, that no lesson showed. Where these do not call the adapted
+network better, no model is written. Where nothing judges, the network is held near its start, and the verdict says so.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import lightning.pytorch as pl
@@ -19,16 +20,17 @@ from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.detective import PairingConfig
 from lightdepth.errors import InputError
-from lightdepth.losses import LossConfig
 from lightdepth.models import DeclineModel, NetworkModel, working_size
 from lightdepth.reporting.run import Run, plain, recorded, run_folder, versions
+from lightdepth.sfm.config import SfmConfig
 
 from ..adapting.card import AdaptedCard, target_loss
 from ..adapting.config import AdaptConfig
-from ..adapting.judging import Outcome, judged, judging_views, map_error
+from ..adapting.judging import Outcome, judged, looked_at, verdict
 from ..adapting.module import Adaptation, merge_low_rank
 from ..adapting.report import Pictures, page
 from ..adapting.target import Target, adaptation, frame_data, read_target, replayed_frames
+from ..adapting.wall_judge import compared, wall_judge
 from ..callbacks import Diagnosis, DiagnosisConfig, TrainingProgress
 from ..datamodule import FrameDataModule
 from ..running import quiet, report_every
@@ -41,6 +43,7 @@ def adapt(
     more: tuple[Path, ...] = (),
     map: Path | None = None,
     fit_light: bool = True,
+    sfm: SfmConfig = SfmConfig(),
     config: Group[AdaptConfig] = AdaptConfig(),
     pairing: Group[PairingConfig] = PairingConfig(),
     keep_worse: bool = False,
@@ -52,15 +55,17 @@ def adapt(
         output: Run folder to make, with the adapted model and a report.
         checkpoint: Model to start from: a path, or the name of a bundled one.
         more: Other sequences of the same endoscope to learn from, such as '[A, B]'.
-        map: Sparse map of the frames; its points find the light where nobody gave it, and judge the result.
+        map: Sparse map of the frames; its points find the light where nobody gave it, teach, and judge the result. Left
+            out, pycolmap makes one of frames without truth.
         fit_light: Where nobody gave the light, fit it on the map and use it if hidden blocks of wall agree.
-        keep_worse: Write the model even when it got worse.
+        sfm: how frames are mapped when there is neither truth nor map
+        keep_worse: Write the model even when it is not better.
         overwrite: Replace a run made before.
     """
-    if map is None and config.taught:
+    if map is None and config.taught and config.judge == "none":
         raise InputError(
             "--points, --overlap",
-            f"{config.points}, {config.overlap} without --map",
+            f"{config.points}, {config.overlap} without --map and with --judge none",
             "expected a map that teaches where they are above 0",
         )
     arguments = recorded(
@@ -72,6 +77,7 @@ def adapt(
         more=more,
         map=map,
         fit_light=fit_light,
+        sfm=sfm,
         keep_worse=keep_worse,
     )
     start = load_model(checkpoint, details=False)
@@ -79,21 +85,27 @@ def adapt(
         raise InputError("--checkpoint", f"{checkpoint} has no weights to adapt", "expected a trained checkpoint")
     quiet()
     with run_folder(output, "adapt", arguments, overwrite) as run:
-        target = read_target(run, source, map, fit_light, config.held_out, start, pairing)
+        target = read_target(run, source, map, fit_light, config, start, sfm, pairing)
         size = config.size or working_size(target.frames[0].camera, start.rows)
         data = frame_data(run, target, more, config, size, start)
         loss = target_loss(start.card, target.light.reflectance > 0, config.replay > 0)
-        views = [] if target.sparse_map is None else judging_views(run, target.frames, target.held, target.sparse_map)
-        module = adaptation(run, target, start, loss, views, config, size)
+        wall = None
+        if target.sparse_map is not None:
+            taught = config.taught_by(True) + config.overlap > 0
+            wall = wall_judge(target.frames, target.held, target.sparse_map, taught, config.seed)
+        closed = looked_at(DeclineModel(details=False), target.held, wall)
+        if closed.truth is None and closed.wall is not None and compared(closed.wall, closed.wall) is None:
+            target = replace(target, unjudged="the map has too few points to judge")
+        module = adaptation(run, target, start, loss, wall, closed.truth is not None, config, size)
 
         pictures = Pictures(target)
         pictures.add(start)
-        before = judged(module, data, start, views)
-        closed = map_error(views, DeclineModel(details=False))
+        before = judged(module, data, start, target.held, wall)
         _fit(module, data, config.steps, run)
         merge_low_rank(module.network)
         adapted = NetworkModel(module.network, size[1], output.name, details=False)
-        outcome = Outcome(before, judged(module, data, adapted, views), closed, keep_worse)
+        after = judged(module, data, adapted, target.held, wall)
+        outcome = Outcome(before, after, closed, verdict(before, after, target.unjudged), keep_worse)
         pictures.add(adapted)
 
         if outcome.written:
@@ -104,7 +116,7 @@ def adapt(
         made = page(target, start, module, outcome, data.counts["val"], light["summary"] if light else None)
         made.wide_figures(pictures.rows())
         made.write(run.folder / "report.html")
-        _record(run, target, module, loss, data, config, outcome)
+        _record(run, start, target, module, data, config, outcome)
 
 
 def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> None:
@@ -148,9 +160,9 @@ def _card(
 
 def _record(
     run: Run,
+    start: NetworkModel,
     target: Target,
     module: Adaptation,
-    loss: LossConfig,
     data: FrameDataModule,
     config: AdaptConfig,
     outcome: Outcome,
@@ -162,19 +174,20 @@ def _record(
             "seed": config.seed,
             "frames": data.counts,
             "light": plain(target.light),
-            "loss": asdict(loss),
+            "loss": asdict(module.loss_config),
+            "anchor": module.anchor,
             "learning_weights": module.learning,
             "criterion": found.criterion,
+            "verdict": str(found),
+            "word": found.word,
             "before": outcome.before.record(),
             "after": outcome.after.record(),
-            "closed_form_map": outcome.closed_form_at_points,
+            "closed_form": outcome.closed_form.record(),
             "better": found.better,
             "written": outcome.written,
-            "units": {"rmse_mm": "mm", "medae_mm": "mm", "map": "share of the distance"},
+            "units": {"rmse_mm": "mm", "medae_mm": "mm", "map": "of log distance"},
         }
     )
-    run.log(str(found))
+    run.log(f"{found}. {outcome.kept(start.name)}.")
     if not outcome.written:
-        run.fail("model.safetensors", f"not written, the adapted network got worse: {found}")
-    elif not found.better:
-        run.log("written all the same, as --keep-worse asks")
+        run.fail("model.safetensors", f"not written, nothing better than {start.name} was found: {found}")

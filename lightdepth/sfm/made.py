@@ -1,0 +1,42 @@
+"""A sparse map as a verb makes it: by pycolmap, in its run folder, with what came of it in log and record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lightdepth.frame import Frame
+from lightdepth.reporting.report import number
+from lightdepth.reporting.run import Run, plain
+from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.reconstruction import sparse_map_from_frames
+from lightdepth.sfm.unmapped import summary
+from lightdepth.sparse_map import SparseMap
+
+
+def made_sparse(
+    run: Run, frames: Sequence[Frame], config: SfmConfig, poses: Mapping[int, np.ndarray] | None = None
+) -> SparseMap:
+    """A map by pycolmap, written to sparse/ in the run folder; `poses` (4, 4) by frame number, where they are known."""
+    stages: list[str] = []
+
+    def show(stage: str, done: int, count: int) -> None:
+        if stage not in stages:
+            stages.append(stage)
+            run.log(f"sparse map: {stage}")
+
+    found = sparse_map_from_frames(frames, run.folder / "sparse", config, show, poses)
+    for submap in found.submaps:
+        errors = number(float(np.median(submap.reprojection_errors())))
+        run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
+    if found.poses is not None:
+        run.log(f"known poses: {found.poses}")
+        run.record["known_poses"] = plain(found.poses)
+    if found.failed:
+        reasons = summary(list(found.failed.values()))
+        run.log(f"{len(found.failed)} of {len(frames)} frames found no place: {reasons}")
+        for name, reason in found.failed.items():
+            run.log(f"  {name}: {reason}")
+    run.record["unregistered"] = found.failed
+    return found
