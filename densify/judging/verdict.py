@@ -13,7 +13,7 @@ from densify.judging.withheld import Withheld
 
 Colour = Literal["green", "amber", "red"]
 
-GREEN, RED = 0.055, 0.11
+GREEN, RED = 0.06, 0.125
 """Disagreement, as a share of the distance, up to which a surface is green and from which it is red."""
 _MISSES = 0.4
 _LEAST = 60

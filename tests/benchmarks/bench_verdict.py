@@ -5,8 +5,8 @@
 Forty runs on colons 910-915 (lenses c3vd, fisheye, pinhole in turn, every second colon of the realistic family), none
 of which anything was tuned on: 100 frames of 160x128 over 30 mm, one submap of a simulated SLAM that errs as a real one
 (lightdepth.tube.slam), with the closed form or a bundled network. What is green, amber and red in truth was fixed
-before the first run: with e the median of |surface - truth| / truth along the rays of the keyframes, e_1 that of the
-same with one scale a keyframe,
+before the first run: with e the median of |surface - truth| / truth along the rays of the keyframes where they truly
+stood, the trajectories brought together by a similarity, and e_1 that of the same with one scale a keyframe,
 
     green: e <= 5 % and e <= 1.2 e_1      red: e > 10 % or e > 1.5 e_1      amber: what is between.
 
@@ -26,11 +26,12 @@ from scipy.stats import spearmanr
 from densify.config import DensifyConfig
 from densify.judging.config import JudgeConfig
 from densify.pipeline import SubmapResult, densify_submap
+from densify.similarity import umeyama
 from lightdepth.checkpoint import load_model
 from lightdepth.datasets import FrameSequence
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
-from lightdepth.sparse_map import Submap
+from lightdepth.sparse_map import Keyframe, Submap
 from lightdepth.tube import lens, realistic, render_sequence
 from lightdepth.tube.map_errors import MapErrors, with_errors
 from lightdepth.tube.slam import SlamConfig, simulate_slam
@@ -99,13 +100,13 @@ def frames_of(scene: int, count: int = 100) -> list[Frame]:
     return render_sequence(seed, count, camera, 0.3 * count, realistic() if seed % 2 else None).frames
 
 
-def submap_of(case: Case) -> tuple[Submap, float]:
-    """The map, and its units per millimetre."""
+def submap_of(case: Case) -> Submap:
+    """The map that the program is given."""
     config = SlamConfig(maps=1, points_per_keyframe=40 if case.few else None)
     if case.independent:
         config = SlamConfig("independent", maps=1, keyframe_every=10)
     slam = simulate_slam(frames_of(case.scene), config, SCENES[case.scene])
-    return with_errors(slam.map.submaps[0], case.errors, SCENES[case.scene]), slam.map_from_world[0][0]
+    return with_errors(slam.map.submaps[0], case.errors, SCENES[case.scene])
 
 
 def shown(case: Case) -> FrameSequence:
@@ -125,17 +126,21 @@ def shown(case: Case) -> FrameSequence:
     return FrameSequence([f.name for f in frames], load, "memory")
 
 
-def true_errors(result: SubmapResult, scale: float, frames: Sequence[Frame]) -> tuple[float, float]:
-    """The median of |surface - truth| / truth along the rays of all keyframes, and the RMS of |surface - truth|, mm;
-    rays that miss the surface apart."""
+def true_errors(result: SubmapResult, frames: Sequence[Frame]) -> tuple[float, float]:
+    """The median of |surface - truth| / truth along the rays of all keyframes where they truly stood, and the RMS of
+    |surface - truth|, mm; rays that miss the surface apart."""
+    keyframes = result.dense.submap.keyframes
+    scale, rotation, translation = _world_from_map(keyframes, frames)
+    vertices = scale * result.dense.vertices @ rotation.T + translation
+    surface = replace(result.dense, vertices=vertices).surface
     shares, lengths = [], []
-    for keyframe in result.dense.submap.keyframes:
-        truth = frames[keyframe.number].true_distance
-        assert truth is not None
-        rows, columns = ((truth > 0) & frames[keyframe.number].valid)[::4, ::4].nonzero()
+    for keyframe in keyframes:
+        frame = frames[keyframe.number]
+        truth, pose = frame.true_distance, frame.true_world_from_cam
+        assert truth is not None and pose is not None
+        rows, columns = ((truth > 0) & frame.valid)[::4, ::4].nonzero()
         rays = keyframe.camera.rays()[0][::4, ::4][rows, columns]
-        hit = result.dense.surface.cast(keyframe.center, rays @ keyframe.cam_from_map[:3, :3]) / scale
-        true = truth[::4, ::4][rows, columns]
+        hit, true = surface.cast(pose[:3, 3], rays @ pose[:3, :3].T), truth[::4, ::4][rows, columns]
         met = np.isfinite(hit)
         shares.append(np.abs(hit[met] / true[met] - 1))
         lengths.append(hit[met] - true[met])
@@ -143,6 +148,21 @@ def true_errors(result: SubmapResult, scale: float, frames: Sequence[Frame]) -> 
     if not len(share):
         return float("inf"), float("inf")
     return float(np.median(share)), float(np.sqrt((length**2).mean()))
+
+
+def _world_from_map(keyframes: Sequence[Keyframe], frames: Sequence[Frame]) -> tuple[float, np.ndarray, np.ndarray]:
+    """The similarity that brings all keyframes nearest to where they truly stood: places, and viewing axes 20 mm long,
+    so that a straight path has a rotation."""
+    true = np.stack([frames[k.number].true_world_from_cam for k in keyframes])
+    own = np.linalg.inv(np.stack([k.cam_from_map for k in keyframes]))
+    spread = [np.sqrt(((p[:, :3, 3] - p[:, :3, 3].mean(0)) ** 2).sum()) for p in (own, true)]
+    length = 20 * spread[0] / spread[1]
+    source, target = (
+        np.concatenate([p[:, :3, 3], *(p[:, :3, 3] + d * p[:, :3, axis] for axis in range(3))])
+        for p, d in ((own, length), (true, 20.0))
+    )
+    scale, rotation, translation = umeyama(source, target)
+    return float(scale), rotation, translation
 
 
 @dataclass(frozen=True)
@@ -164,7 +184,7 @@ class Row:
 
 
 def run(case: Case) -> Row:
-    frames, (submap, scale) = shown(case), submap_of(case)
+    frames, submap = shown(case), submap_of(case)
     model = load_model(case.model) if case.model == "constant" else load_model(case.model, details=False)
     kept = {}
 
@@ -175,7 +195,7 @@ def run(case: Case) -> Row:
 
     full, scaled, unbraked = (densify_submap(submap, frames, once, c) for c in (FULL, SCALED, UNBRAKED))
     truth = frames_of(case.scene)
-    (e, rms), (e1, rms1), (_, rms_before) = (true_errors(r, scale, truth) for r in (full, scaled, unbraked))
+    (e, rms), (e1, rms1), (_, rms_before) = (true_errors(r, truth) for r in (full, scaled, unbraked))
     j = full.judgement
     assert j is not None
     return Row(case, e, e1, (rms, rms1, rms_before), j.number, j.verdict.colour, j.verdict.sentence, j.undone)
