@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
 from densify.joining import MergeConfig, Merged, joined_name, merge
-from densify.judging.verdict import Verdict, worst
+from densify.judging.verdict import Colour, Verdict, worst
 from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify
 from densify.predictions import SeenKeyframe
@@ -28,6 +28,8 @@ class Densified:
     results: Sequence[SubmapResult]
     gallery: Gallery
     merged: Merged | None = None
+    doubts: tuple[str, ...] = ()
+    """sentences on what the surfaces were made of, with which no verdict is green"""
 
     @classmethod
     def make(
@@ -56,7 +58,11 @@ class Densified:
     @property
     def verdict(self) -> Verdict | None:
         """On all of them: the worst; None where nothing was judged."""
-        return worst([r.judgement.verdict for r in self.results if r.judgement is not None])
+        found = worst([r.judgement.verdict for r in self.results if r.judgement is not None])
+        if found is None or not self.doubts:
+            return found
+        colour: Colour = "red" if found.colour == "red" else "amber"
+        return Verdict(colour, "; ".join([*self.doubts, found.sentence]))
 
     def notes(self, of: str, frames: FrameSequence, light_fit: Mapping[str, object] | None) -> list[str]:
         """Sentences for the page: what the surfaces were made of (`of`), under which light, and what is weak."""

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from densify.config import DensifyConfig
+from densify.dense_map import DenseMap
+from densify.densified import Densified
 from densify.fusion.volume import FusionConfig
 from densify.judging.brake import Tried, undone
 from densify.judging.columns import Columns
 from densify.judging.config import JudgeConfig
 from densify.judging.verdict import Judgement, Verdict, worst
 from densify.judging.withheld import Withheld
-from densify.pipeline import densify_submap
+from densify.page import Gallery
+from densify.pipeline import SubmapResult, densify_submap
 from lightdepth.camera import Pinhole
 from lightdepth.parallax import ParallaxConfig
 from lightdepth.prediction import DepthPrediction
@@ -167,7 +170,7 @@ def known(**changes) -> Judgement:
         ("green", "2.0%", {}),
         ("amber", "8.0%", {"surface": Withheld(500, 0.08, 0.2, 0.0, 0.08)}),
         ("red", "15.0%", {"surface": Withheld(500, 0.15, 0.3, 0.0, 0.15)}),
-        ("red", "only 4 of 10 keyframes", {"aligned": 4}),
+        ("amber", "only 4 of 10 keyframes", {"aligned": 4}),
         ("red", "no keyframe", {"aligned": 0}),
         ("green", "2.0% against 2.0%", {"images": Columns(500, 0.03, 0.02, 0.2, 0.02)}),
         ("amber", "against the images (8.0% off", {"images": Columns(500, 0.03, 0.08, 0.2, 0.1), "undone": 6}),
@@ -183,3 +186,11 @@ def test_the_verdict_has_a_colour_and_a_reason_with_figures(colour, sentence, ch
 def test_the_verdict_on_a_run_is_that_of_its_worst_map():
     green, red = Verdict("green", "a"), Verdict("red", "b")
     assert worst([green, red, green]) is red and worst([]) is None
+
+
+def test_a_doubtful_pairing_of_frames_and_map_is_never_green():
+    result = SubmapResult(DenseMap.empty(slam(colon(0).frames).map.submaps[0], "nothing"), known())
+    work = Densified("mine", [result], Gallery(slam(colon(0).frames).map))
+    assert work.verdict is not None and work.verdict.colour == "green"
+    work.doubts = ("frames and map may be apart",)
+    assert work.verdict.colour == "amber" and work.verdict.sentence.startswith("frames and map may be apart; ")

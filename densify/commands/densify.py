@@ -68,6 +68,9 @@ def densify(
         run.hash_inputs(**source.files, map=mapped.map)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         work = Densified.make(frames, sparse_map, model, config, merging if merge else None)
+        pairing = run.record.get("pairing") or {}
+        if pairing.get("judgement") in ("doubtful", "wrong"):
+            work.doubts = (pairing["sentence"],)
         work.write(run, formats, mm_per_unit)
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
         notes += [f"Warning: {said}" for said in run.record["warnings"]]

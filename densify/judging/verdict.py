@@ -13,7 +13,7 @@ from densify.judging.withheld import Withheld
 
 Colour = Literal["green", "amber", "red"]
 
-GREEN, RED = 0.06, 0.125
+GREEN, RED = 0.068, 0.125
 """Disagreement, as a share of the distance, up to which a surface is green and from which it is red."""
 _MISSES = 0.4
 _LEAST = 60
@@ -120,7 +120,7 @@ def _verdict(j: Judgement) -> Verdict:
         if not number <= RED:
             red.append(f"hidden blocks of the map's wall are {_share(number)} off, and the images say nothing")
     if 2 * j.aligned < j.keyframes:
-        red.append(f"only {j.aligned} of {j.keyframes} keyframes could be aligned")
+        amber.append(f"only {j.aligned} of {j.keyframes} keyframes could be aligned")
     if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
         amber.append(
             f"the map's points bend the depth against the images ({_share(j.images.bent)} off, one scale "
