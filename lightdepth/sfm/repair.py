@@ -4,7 +4,8 @@ A SLAM sees each frame once and in a hurry: its scale drifts, and points of one 
 are matched with all that look alike, points are triangulated at the poses that the map gives, and poses and points are
 adjusted together, in rounds whose tolerance shrinks, so that poses that are some pixels off are still drawn in. A
 mapping that knows no poses is made besides, for maps that are too far off. Of the two, the one that holds more
-keyframes, and then more observations, is brought to the map's frame and scale. The calibration stays as it is.
+keyframes, and then more observations closer to their points, is brought to the map's frame and scale. The calibration
+stays as it is.
 
 With sfm.features and sfm.reconstruction the only module that uses pycolmap.
 """
@@ -56,6 +57,8 @@ class Repair:
     """median reprojection error of the map's own observations, pixels"""
     agree: tuple[int, int]
     """how many observations of the new matches lie within 4 px of their point, at the poses given and at the new"""
+    agree_px: tuple[float, float]
+    """how far these are from their points, root mean square, pixels"""
     moved: float
     """median displacement of the camera centres, as a share of the path's length"""
     begun: str = ""
@@ -72,7 +75,8 @@ class Repair:
                 ("keyframes", self.keyframes),
                 ("points", self.points),
                 ("median px", self.px),
-                ("observations that agree", self.agree),
+                ("new observations that agree", self.agree),
+                ("their px", self.agree_px),
             )
         ]
         moved = f"centres moved by {self.moved:.2%} of the path in the median"
@@ -106,13 +110,12 @@ def repaired_submap(
         progress("mapping", 0, len(given))
         before, found = _made_anew(work, given, config)
         progress("mapping", len(given), len(given))
-        begun, model = max(found.items(), key=lambda made: _held(made[1])) if found else ("", None)
-        held, after = _held(model) if model is not None else (0, 0)
-        if model is None or held < _KEPT * len(given) or model.num_points3D() < config.min_points:
-            reason = f"the images hold {held} of {len(given)} keyframes together"
+        begun, (model, after) = max(found.items(), key=lambda made: made[1][1].key, default=("", (None, _Held())))
+        if model is None or after.keyframes < _KEPT * len(given) or model.num_points3D() < config.min_points:
+            reason = f"the images hold {after.keyframes} of {len(given)} keyframes together"
             return _as_it_was(submap, out_folder, reason, before)
-        if after < before:
-            reason = f"{before} observations agree with its poses, {after} with new ones"
+        if after.score <= before.score:
+            reason = f"the images agree with its poses as they are ({before}; with new ones {after})"
             return _as_it_was(submap, out_folder, reason, before)
         _bring_to(model, given)
         model.write_text(work / "model")
@@ -125,26 +128,53 @@ def repaired_submap(
         (len(submap.keyframes), len(new.keyframes)),
         (len(submap.points), len(new.points)),
         (_px(submap), _px(new)),
-        (before, after),
+        (before.observations, after.observations),
+        (before.px, after.px),
         _moved(submap, new),
         begun,
     )
 
 
-def _as_it_was(submap: Submap, folder: Path, reason: str, agree: int = 0) -> tuple[Submap, Repair]:
+def _as_it_was(submap: Submap, folder: Path, reason: str, held: _Held | None = None) -> tuple[Submap, Repair]:
     write_text_model(submap, folder)
-    keyframes, points, px = len(submap.keyframes), len(submap.points), _px(submap)
-    same = Repair(submap.id, (keyframes, keyframes), (points, points), (px, px), (agree, agree), 0.0)
+    keyframes, points, px, held = len(submap.keyframes), len(submap.points), _px(submap), held or _Held()
+    agree, agree_px = (held.observations, held.observations), (held.px, held.px)
+    same = Repair(submap.id, (keyframes, keyframes), (points, points), (px, px), agree, agree_px, 0.0)
     return submap, replace(same, left=reason)
 
 
-def _made_anew(work: Path, given: Mapping[str, np.ndarray], config: SfmConfig) -> tuple[int, dict[str, Any]]:
-    """How many observations agree with the poses given, and the models made, by where their poses come from."""
+@dataclass(frozen=True)
+class _Held:
+    """What the images hold of a model."""
+
+    keyframes: int = 0
+    observations: int = 0
+    px: float = float("nan")
+    """root mean square distance of observations from their points"""
+
+    @property
+    def score(self) -> float:
+        """Observations, each counting less the farther it is: 1 at its point, 0 at the bound (MSAC)."""
+        return self.observations * (1 - (self.px / _ROUNDS_PX[-1]) ** 2) if self.observations else 0.0
+
+    @property
+    def key(self) -> tuple[int, float]:
+        """Of two models the one with the larger is better."""
+        return self.keyframes, self.score
+
+    def __str__(self) -> str:
+        return f"{self.observations} observations {self.px:.2f} px from their points"
+
+
+def _made_anew(
+    work: Path, given: Mapping[str, np.ndarray], config: SfmConfig
+) -> tuple[_Held, dict[str, tuple[Any, _Held]]]:
+    """What the images hold at the poses given, and the models made, by where their poses come from."""
     pc = pycolmap()
     made: dict[str, Any] = {}
     with quiet(pc):
         model = triangulated_anew(model_at_poses(work, given), work, mapping_options(pc, config))
-        before = int(model.compute_num_observations())
+        before = _held(model)
         for px in _ROUNDS_PX:
             options = mapping_options(pc, config)
             options.mapper.filter_max_reproj_error = px
@@ -154,16 +184,16 @@ def _made_anew(work: Path, given: Mapping[str, np.ndarray], config: SfmConfig) -
                 break
             _adjust(pc, model, config)
         else:
-            _filter(pc, model, _ROUNDS_PX[-1])
             made["its poses"] = model
         mapping = mapping_options(pc, config)
         mapping.multiple_models = False
         models = pc.incremental_mapping(work / "database.db", work / "images", work / "mapping", mapping)
         if models:
-            made["the images alone"] = max(models.values(), key=_held)
-    for model in made.values():
-        _without_loose_images(model)
-    return before, made
+            made["the images alone"] = max(models.values(), key=lambda m: m.num_reg_images())
+        for model in made.values():
+            _filter(pc, model, _ROUNDS_PX[-1])
+            _without_loose_images(model)
+    return before, {begun: (model, _held(model)) for begun, model in made.items()}
 
 
 def _adjust(pc: Any, model: Any, config: SfmConfig) -> None:
@@ -193,9 +223,14 @@ def _without_loose_images(model: Any) -> None:
             model.deregister_frame(image.frame_id)
 
 
-def _held(model: Any) -> tuple[int, int]:
-    """Keyframes and observations that a model holds: more are better."""
-    return int(model.num_reg_images()), int(model.compute_num_observations())
+def _held(model: Any) -> _Held:
+    squares = [
+        float(((image.project_point(model.point3D(p.point3D_id).xyz) - p.xy) ** 2).sum())
+        for image in (model.image(i) for i in model.reg_image_ids())
+        for p in image.get_observation_points2D()
+    ]
+    px = float(np.sqrt(np.mean(squares))) if squares else float("nan")
+    return _Held(int(model.num_reg_images()), len(squares), px)
 
 
 def _bring_to(model: Any, given: Mapping[str, np.ndarray]) -> None:
