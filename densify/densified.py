@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
 from densify.joining import MergeConfig, Merged, joined_name, merge
-from densify.judging.verdict import Colour, Verdict, worst
+from densify.judging.verdict import Colour, Verdict, proposal, worst
 from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify
 from densify.predictions import SeenKeyframe
@@ -63,6 +63,11 @@ class Densified:
             return found
         colour: Colour = "red" if found.colour == "red" else "amber"
         return Verdict(colour, "; ".join([*self.doubts, found.sentence]))
+
+    def proposals(self) -> dict[int, str]:
+        """What could make a map better, by its id, where the images speak against it."""
+        told = {r.dense.submap.id: proposal(r.judgement) for r in self.results if r.judgement is not None}
+        return {map_id: said for map_id, said in told.items() if said}
 
     def notes(self, of: str, frames: FrameSequence, light_fit: Mapping[str, object] | None) -> list[str]:
         """Sentences for the page: what the surfaces were made of (`of`), under which light, and what is weak."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,14 +13,15 @@ from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.detective import PairingConfig, check_pairing
 from lightdepth.errors import InputError
-from lightdepth.frame import check_image_size
+from lightdepth.frame import Frame, check_image_size
 from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
 from lightdepth.maps import read_map
 from lightdepth.models import ConstantModel, DepthModel
-from lightdepth.reporting.run import Run
+from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.made import made_sparse
+from lightdepth.sfm.repair import repaired_submap
 from lightdepth.sparse_map import Keyframe, SparseMap
 
 
@@ -29,6 +31,9 @@ class MapSource(PairingConfig):
 
     map: Path | None = None
     """Sparse map of the frames: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the frames."""
+    repair_map: bool = False
+    """Make the map anew from the images of its keyframes before it is used, beginning at its poses, and keep its frame
+    and scale; written to sparse/ in the run folder."""
 
 
 def map_and_frames(
@@ -50,7 +55,34 @@ def map_and_frames(
         run.log(f"map made at {map_camera.width}x{map_camera.height}, rescaled to the frames' {width}x{height}")
     fitted = fitted_to_frames(sparse_map, width, height, given)  # first: a cropped image is refused by its size
     check_pairing(sparse_map, frames, mapped, run, given)
-    return fitted, frames
+    return (repaired(run, fitted, frames, sfm) if mapped.repair_map else fitted), frames
+
+
+def repaired(run: Run, sparse_map: SparseMap, frames: FrameSequence, config: SfmConfig) -> SparseMap:
+    """The map made anew from the images of its keyframes, submap by submap, written to sparse/ in the run folder."""
+    submaps, told = [], []
+    for submap in sparse_map.submaps:
+        seen = [k for k in submap.keyframes if k.number in frames.numbers]
+        images = FrameSequence([k.name for k in seen], _ImagesOf(frames, seen), frames.source) if seen else []
+        run.log(f"repair of map {submap.id}: {len(seen)} keyframes are matched")
+        new, repair = repaired_submap(submap, images, run.folder / "sparse" / str(submap.id), config)
+        worse = repair.left or len(new.keyframes) < len(seen)
+        (run.warn if worse else run.log)(f"repair: {repair}")
+        submaps.append(new)
+        told.append(repair)
+    run.record["repair"] = plain(told)
+    return replace(sparse_map, submaps=tuple(submaps))
+
+
+@dataclass(frozen=True)
+class _ImagesOf:
+    """Loads the images of keyframes, under the map's camera."""
+
+    frames: FrameSequence
+    keyframes: Sequence[Keyframe]
+
+    def __call__(self, i: int) -> Frame:
+        return self.frames.of_keyframe(self.keyframes[i])
 
 
 def check_unit(mm_per_unit: float | None) -> None:

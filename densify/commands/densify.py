@@ -72,8 +72,13 @@ def densify(
         if pairing.get("judgement") in ("doubtful", "wrong"):
             work.doubts = (pairing["sentence"],)
         work.write(run, formats, mm_per_unit)
+        proposals = {} if mapped.map is None or mapped.repair_map else work.proposals()
+        for map_id, proposal in proposals.items():
+            run.log(f"map {map_id}: {proposal}")
+        run.record["proposals"] = proposals
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
         notes += [f"Warning: {said}" for said in run.record["warnings"]]
+        notes += [f"Map {map_id}: {proposal}." for map_id, proposal in proposals.items()]
         page = densify_page("Densified maps", work.results, work.gallery, notes, None, mm_per_unit)
         if work.merged is not None:
             joined_section(page, work.merged)

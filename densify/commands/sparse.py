@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from densify.inputs import MapSource, map_and_frames
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
@@ -21,10 +22,11 @@ def sparse(
     camera: Path | None = None,
     mask: Path | None = None,
     poses: str | None = None,
+    repair: Path | None = None,
     sfm: SfmConfig = SfmConfig(),
     overwrite: bool = False,
 ) -> None:
-    """A sparse map by pycolmap, where there is no SLAM output.
+    """A sparse map by pycolmap, where there is no SLAM output or a poor one.
 
     Args:
         data: Folder of frames, or video, to map.
@@ -35,13 +37,22 @@ def sparse(
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         poses: Known poses, at which points are only triangulated: truth, those of the sequence, or a TUM file (world
             from camera) whose times are frame numbers.
+        repair: Sparse map of the frames to make anew from its keyframes' images, beginning at its poses, in its frame
+            and scale.
         sfm: how frames are mapped
         overwrite: Replace a folder made before.
     """
+    if repair is not None and poses is not None:
+        raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
     source = SequenceSource(data, format, camera, mask=mask)
-    arguments = recorded(output=output, data=data, format=format, camera=camera, mask=mask, poses=poses, sfm=sfm)
+    arguments = recorded(
+        output=output, data=data, format=format, camera=camera, mask=mask, poses=poses, repair=repair, sfm=sfm
+    )
     with run_folder(output, "sparse", arguments, overwrite) as run:
-        run.hash_inputs(data=data)
+        run.hash_inputs(data=data, repair=repair)
+        if repair is not None:
+            map_and_frames(run, source, MapSource(map=repair, repair_map=True), sfm)
+            return
         frames = source.open()
         made_sparse(run, frames, sfm, None if poses is None else _poses(poses, frames))
 

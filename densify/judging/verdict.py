@@ -94,6 +94,22 @@ class Verdict:
         return f"{self.colour}: {self.sentence}"
 
 
+def proposal(j: Judgement) -> str:
+    """What could make the map of a surface better, in one sentence; empty where the images do not speak against it.
+
+    That the map's error and not the light's is what they see, they cannot tell: it may help, and is soon tried.
+    """
+    if j.surface is None or j.surface.points < _LEAST:
+        return ""
+    if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
+        seen = "its points bend the depth against the images"
+    elif j.number > GREEN:
+        seen = f"the images put the wall {_share(j.number)} from the surface"
+    else:
+        return ""
+    return f"the map may be at fault ({seen}): --repair-map makes it anew from the images of its keyframes"
+
+
 def worst(verdicts: Sequence[Verdict]) -> Verdict | None:
     """The verdict on a run: the worst of its submaps'."""
     order = ("green", "amber", "red")

@@ -1,6 +1,6 @@
 """What COLMAP is given: frames as images with masks and evened contrast, their features, and verified matches.
 
-With sfm.reconstruction the only module that uses pycolmap.
+With sfm.reconstruction and sfm.repair the only module that uses pycolmap.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ connect becomes a submap of its own, with its own scale; a frame that finds no p
 Where poses are known, points are only triangulated. COLMAP knows no Scaramuzza camera: such a lens is replaced by the
 Kannala-Brandt camera that comes closest, and given back to the keyframes.
 
-With sfm.features the only module that uses pycolmap. With one thread and a seed, as is the default, equal frames give
-equal maps.
+With sfm.features and sfm.repair the only module that uses pycolmap. With one thread and a seed, as is the default,
+equal frames give equal maps.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def sparse_map_from_frames(
     InputError, leaving out_folder as it was, when the frames cannot be mapped, the folder already holds a map, or the
     matches fit the poses only when these are read in another way, which is named.
     """
-    config, progress, out_folder = config or SfmConfig(), progress or _silent, Path(out_folder)
-    _check_free(out_folder)
+    config, progress, out_folder = config or SfmConfig(), progress or silent, Path(out_folder)
+    check_free(out_folder)
     # On the target's disk, so that the finished models arrive by a rename.
     existing = next(p for p in out_folder.resolve().parents if p.is_dir())
     with tempfile.TemporaryDirectory(prefix=".sfm-", dir=existing) as work:
@@ -85,14 +85,14 @@ def sparse_map_from_frames(
         if known is None:
             count = _reconstruct(Path(work), len(names), config, progress)
         else:
-            fitting = fitting_poses(far_matches(Path(work), sorted(known), _JUDGED), known, camera, _turn(fit))
+            fitting = fitting_poses(far_matches(Path(work), sorted(known), _JUDGED), known, camera, turn_of(fit))
             if fitting.poor:
                 warnings.warn(f"known poses: only {fitting}: are they the poses of these frames?", stacklevel=2)
-            at = {name: _turn(fit) @ np.linalg.inv(pose) for name, pose in known.items()}
+            at = {name: turn_of(fit) @ np.linalg.inv(pose) for name, pose in known.items()}
             count = _triangulated(Path(work), at, config, progress)
         submaps = read_map(models).submaps if count else ()
         if fit:
-            submaps = tuple(_with_camera(s, written.camera, fit.rotation) for s in submaps)
+            submaps = tuple(with_camera(s, written.camera, fit.rotation) for s in submaps)
         registered = {k.name for s in submaps for k in s.keyframes}
         why = reasons(written.measures, matching, np.array([name in registered for name in names]))
         failed = {written.names[name]: reason for name, reason in zip(names, why, strict=True) if reason}
@@ -127,7 +127,7 @@ def _known_poses(poses: Mapping[int, np.ndarray], names: Mapping[str, str]) -> d
     return known
 
 
-def _turn(fit: Conversion | None) -> np.ndarray:
+def turn_of(fit: Conversion | None) -> np.ndarray:
     """(4, 4) from the axes of the frames' camera to those of the camera that COLMAP is given."""
     turn = np.eye(4)
     if fit:
@@ -165,7 +165,7 @@ def _reconstruct(work: Path, count: int, config: SfmConfig, progress: Progress) 
             work / "database.db",
             work / "images",
             work / "colmap",
-            _mapping_options(pc, config),
+            mapping_options(pc, config),
             next_image_callback=one_more,
         )
         large = [m for m in models.values() if m.num_reg_images() >= config.min_model_size]
@@ -178,32 +178,43 @@ def _reconstruct(work: Path, count: int, config: SfmConfig, progress: Progress) 
 
 def _triangulated(work: Path, known: Mapping[str, np.ndarray], config: SfmConfig, progress: Progress) -> int:
     """Triangulates the matches at known cam_from_map (4, 4) by file name; writes the model, returns 1, or 0 without."""
-    pc, database = pycolmap(), work / "database.db"
+    pc = pycolmap()
     (work / "colmap").mkdir()
     progress("mapping", 0, len(known))
     with quiet(pc):
-        model = pc.Reconstruction()
-        with pc.Database.open(database) as opened:
-            (camera,) = opened.read_all_cameras()
-            model.add_camera_with_trivial_rig(camera)
-            for name, pose in sorted(known.items()):
-                image_id = opened.read_image_with_name(name).image_id
-                image = pc.Image(name=name, camera_id=camera.camera_id, image_id=image_id)
-                model.add_image_with_trivial_frame(image, pc.Rigid3d(pose[:3]))
-        model = pc.triangulate_points(
-            model,
-            database,
-            work / "images",
-            work / "colmap",
-            clear_points=True,
-            options=_mapping_options(pc, config),
-            refine_intrinsics=False,
-        )
+        model = triangulated_anew(model_at_poses(work, known), work, mapping_options(pc, config))
         if model.num_points3D() < config.min_points:
             return 0
         _write_model(model, work, 0)
     progress("mapping", len(known), len(known))
     return 1
+
+
+def model_at_poses(work: Path, known: Mapping[str, np.ndarray]) -> Any:
+    """A COLMAP model without points: images of work/database.db at known cam_from_map (4, 4) by file name."""
+    pc = pycolmap()
+    model = pc.Reconstruction()
+    with pc.Database.open(work / "database.db") as opened:
+        (camera,) = opened.read_all_cameras()
+        model.add_camera_with_trivial_rig(camera)
+        for name, pose in sorted(known.items()):
+            image_id = opened.read_image_with_name(name).image_id
+            image = pc.Image(name=name, camera_id=camera.camera_id, image_id=image_id)
+            model.add_image_with_trivial_frame(image, pc.Rigid3d(pose[:3]))
+    return model
+
+
+def triangulated_anew(model: Any, work: Path, options: Any) -> Any:
+    """The model with all its points triangulated from the matches of work/database.db, at its poses."""
+    return pycolmap().triangulate_points(
+        model,
+        work / "database.db",
+        work / "images",
+        work / "colmap",
+        clear_points=True,
+        options=options,
+        refine_intrinsics=False,
+    )
 
 
 def _write_model(model: Any, work: Path, index: int) -> None:
@@ -212,7 +223,7 @@ def _write_model(model: Any, work: Path, index: int) -> None:
     model.write_text(folder)
 
 
-def _mapping_options(pc: Any, config: SfmConfig) -> Any:
+def mapping_options(pc: Any, config: SfmConfig) -> Any:
     options = pc.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = config.seed
     options.num_threads = options.mapper.num_threads = config.num_threads
@@ -226,7 +237,7 @@ def _mapping_options(pc: Any, config: SfmConfig) -> Any:
     return options
 
 
-def _with_camera(submap: Submap, camera: CameraModel, rotation: np.ndarray) -> Submap:
+def with_camera(submap: Submap, camera: CameraModel, rotation: np.ndarray) -> Submap:
     """The submap seen by the camera that was replaced: pixel = mapped(rotation @ ray) = camera(ray)."""
     back = np.eye(4)
     back[:3, :3] = rotation.T
@@ -237,7 +248,7 @@ def _with_camera(submap: Submap, camera: CameraModel, rotation: np.ndarray) -> S
     return replace(submap, keyframes=tuple(restored(k) for k in submap.keyframes))
 
 
-def _check_free(out_folder: Path) -> None:
+def check_free(out_folder: Path) -> None:
     if out_folder.exists() and not out_folder.is_dir():
         raise InputError(out_folder, "a file", "expected a folder to write the map to")
     taken = [p for p in out_folder.glob("*") if p.name.isdigit()] if out_folder.is_dir() else []
@@ -251,5 +262,5 @@ def _move_models(models: Path, out_folder: Path) -> None:
         shutil.move(folder, out_folder / folder.name)
 
 
-def _silent(stage: str, done: int, count: int) -> None:
+def silent(stage: str, done: int, count: int) -> None:
     pass
