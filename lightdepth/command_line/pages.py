@@ -104,7 +104,6 @@ PAGES = {
     ),
     "sparse": Page(
         (
-            "lightdepth sparse data/mine -o runs/map",
             "lightdepth sparse data/mine -o runs/map --poses trajectory.tum --mask mask.png",
             "lightdepth sparse data/mine -o runs/map --repair maps/slam",
         ),
