@@ -71,7 +71,7 @@ def test_the_images_see_that_a_side_of_the_wall_was_moved_and_the_bend_is_undone
     aligned = [a for a in result.dense.alignments if a.ok]
     assert judgement.undone > 0.7 * len(aligned)
     assert all("the images" in a.unbent_because for a in aligned if a.bend is None)
-    assert judgement.verdict.colour != "green"
+    assert "against the images" in judgement.verdict.sentence
 
 
 def test_where_the_map_is_right_the_bends_stay(submap, frames):
@@ -173,7 +173,7 @@ def known(**changes) -> Judgement:
         ("amber", "only 4 of 10 keyframes", {"aligned": 4}),
         ("red", "no keyframe", {"aligned": 0}),
         ("green", "2.0% against 2.0%", {"images": Columns(500, 0.03, 0.02, 0.2, 0.02)}),
-        ("amber", "against the images (8.0% off", {"images": Columns(500, 0.03, 0.08, 0.2, 0.1), "undone": 6}),
+        ("green", "against the images (8.0% off", {"images": Columns(500, 0.03, 0.08, 0.2, 0.1), "undone": 6}),
         ("amber", "50% of what they see is not", {"surface": Withheld(500, np.inf, np.inf, 0.5, 0.02)}),
         ("red", "infinitely far", {"surface": None, "hidden": None}),
     ],

@@ -13,7 +13,7 @@ from densify.judging.withheld import Withheld
 
 Colour = Literal["green", "amber", "red"]
 
-GREEN, RED = 0.068, 0.125
+GREEN, RED = 0.065, 0.125
 """Disagreement, as a share of the distance, up to which a surface is green and from which it is red."""
 _MISSES = 0.4
 _LEAST = 60
@@ -137,13 +137,13 @@ def _verdict(j: Judgement) -> Verdict:
             red.append(f"hidden blocks of the map's wall are {_share(number)} off, and the images say nothing")
     if 2 * j.aligned < j.keyframes:
         amber.append(f"only {j.aligned} of {j.keyframes} keyframes could be aligned")
+    light = j.images if j.images.count >= _LEAST else j.blocks
+    remarks = []
     if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
-        amber.append(
+        remarks.append(
             f"the map's points bend the depth against the images ({_share(j.images.bent)} off, one scale "
             f"{_share(j.images.one_scale)}): they may err together, and {j.undone} keyframes keep one scale"
         )
-    light = j.images if j.images.count >= _LEAST else j.blocks
-    remarks = []
     if not light.best < _NO_MERIT * light.constant:
         remarks.append(
             "the light adds nothing here: a constant distance does as well "
