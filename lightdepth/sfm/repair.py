@@ -190,9 +190,10 @@ def _made_anew(
         models = pc.incremental_mapping(work / "database.db", work / "images", work / "mapping", mapping)
         if models:
             made["the images alone"] = max(models.values(), key=lambda m: m.num_reg_images())
-        for model in made.values():
-            _filter(pc, model, _ROUNDS_PX[-1])
-            _without_loose_images(model)
+        for begun, model in made.items():
+            # Once more as at the poses given: what is compared was triangulated alike.
+            made[begun] = triangulated_anew(model, work, mapping_options(pc, config))
+            _without_loose_images(made[begun])
     return before, {begun: (model, _held(model)) for begun, model in made.items()}
 
 
@@ -208,11 +209,6 @@ def _adjust(pc: Any, model: Any, config: SfmConfig) -> None:
         images.add_image(image_id)
     images.fix_gauge(pc.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pc.create_default_bundle_adjuster(options, images, model).solve()
-
-
-def _filter(pc: Any, model: Any, px: float) -> None:
-    """Takes out observations farther than this from their point."""
-    pc.ObservationManager(model).filter_points3D_with_large_reprojection_error(px, set(model.point3D_ids()))
 
 
 def _without_loose_images(model: Any) -> None:
