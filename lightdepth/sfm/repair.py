@@ -39,6 +39,7 @@ from lightdepth.sfm.reconstruction import (
 from lightdepth.sparse_map import Submap
 
 _ROUNDS_PX = (16.0, 8.0, 4.0)  # how far an observation may be from its point; the last is COLMAP's own bound
+_NEAR_PX = 2.0  # an observation this far from its point says nothing for a pose: wrong poses have many such
 _POSED = 10  # points that a keyframe must see: fewer do not hold its pose
 _KEPT = 0.75  # of the keyframes must be held by the images: a map with fewer is no better one
 
@@ -152,10 +153,8 @@ class _Held:
     px: float = float("nan")
     """root mean square distance of observations from their points"""
 
-    @property
-    def score(self) -> float:
-        """Observations, each counting less the farther it is: 1 at its point, 0 at the bound (MSAC)."""
-        return self.observations * (1 - (self.px / _ROUNDS_PX[-1]) ** 2) if self.observations else 0.0
+    score: float = 0.0
+    """observations, each counting less the farther it is: 1 at its point, 0 from 2 px on (MSAC)"""
 
     @property
     def key(self) -> tuple[int, float]:
@@ -220,13 +219,15 @@ def _without_loose_images(model: Any) -> None:
 
 
 def _held(model: Any) -> _Held:
-    squares = [
+    found = [
         float(((image.project_point(model.point3D(p.point3D_id).xyz) - p.xy) ** 2).sum())
         for image in (model.image(i) for i in model.reg_image_ids())
         for p in image.get_observation_points2D()
     ]
-    px = float(np.sqrt(np.mean(squares))) if squares else float("nan")
-    return _Held(int(model.num_reg_images()), len(squares), px)
+    squares = np.array(found)
+    px = float(np.sqrt(squares.mean())) if found else float("nan")
+    score = float(np.maximum(1 - squares / _NEAR_PX**2, 0).sum())
+    return _Held(int(model.num_reg_images()), len(found), px, score)
 
 
 def _bring_to(model: Any, given: Mapping[str, np.ndarray]) -> None:
