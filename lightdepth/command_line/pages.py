@@ -103,9 +103,7 @@ PAGES = {
         )
     ),
     "sparse": Page(
-        (
-            "lightdepth sparse data/mine -o runs/map --poses trajectory.tum --mask mask.png",
-        ),
+        ("lightdepth sparse data/mine -o runs/map --poses trajectory.tum --mask mask.png",),
         more=("sfm.matching", "sfm.max_features", "sfm.peak_threshold", "sfm.num_threads", "sfm.seed"),
     ),
     "densify": Page(
