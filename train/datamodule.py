@@ -71,8 +71,8 @@ class FrameData:
     augment: bool = True
     """Whether exposure is varied and images are flipped at random."""
     reflectance_error: float = 0.0
-    """Share added to what is known of each wall's reflectance, to see what a wrong calibration costs. A larger one
-    makes it more wrong."""
+    """Added to each wall's known reflectance, itself a share up to 0.95: 0.3 takes 0.4 for 0.7. It shows what a wrong
+    calibration costs, to the loss only with --model.loss.reflectance null. A larger one makes it more wrong."""
     random_reflectance: tuple[float, float] | None = None
     """Ends of a range, shares in [0, 1), from which each image's reflectance is drawn anew at every step, whatever is
     known of it: for networks that have it as an input and are to obey it. A larger one means more indirect light."""

@@ -103,7 +103,10 @@ PAGES = {
         )
     ),
     "sparse": Page(
-        ("lightdepth sparse data/mine -o runs/map --poses trajectory.tum --mask mask.png",),
+        (
+            "lightdepth sparse data/mine -o runs/map --poses trajectory.tum --mask mask.png",
+            "lightdepth sparse data/mine -o runs/map --repair maps/slam",
+        ),
         more=("sfm.matching", "sfm.max_features", "sfm.peak_threshold", "sfm.num_threads", "sfm.seed"),
     ),
     "densify": Page(

@@ -68,7 +68,7 @@ class LossConfig:
     higher one straightens less, and 1 nothing."""
     huber: float = 0.05
     """Residual, in the units of `space`, at which the photometric term turns from square to linear; 0 is L1. A larger
-    one weighs large residuals more."""
+    one weighs small residuals less against large ones."""
     white: float = 0.97
     """Brightness, in [0, 1], from which a pixel counts as saturated. A higher one counts fewer pixels."""
     bounces: int = 3

@@ -42,7 +42,8 @@ def ablate(
 
     Args:
         output: Run folder; rows that are already in it, made with the same settings, are kept.
-        base: Training preset that all rows start from, a YAML file.
+        base: Training preset that all rows start from, a YAML file; a row's own preset, where it has one, replaces its
+            model part.
         settings: Dotted options of `train` and their values, changed for all rows.
         rows: Trainings to compare; the first is what the others are compared with (configs/ablation/lightdepth.yaml
             has some).

@@ -59,7 +59,8 @@ def adapt(
             out, pycolmap makes one of frames without truth.
         fit_light: Where nobody gave the light, fit it on the map and use it if hidden blocks of wall agree.
         sfm: how frames are mapped when there is neither truth nor map
-        keep_worse: Write the model even when it is not better.
+        keep_worse: Write the model even where its judge finds it not better, or it became too unsteady. Where nothing
+            judges, it is written anyway unless it became too unsteady.
         overwrite: Replace a run made before.
     """
     if map is None and config.taught and config.judge == "none":
