@@ -27,7 +27,7 @@ from densify.evaluation.suite import Suite, present, read_suite
 from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.evaluation.truth import check_truth, read_truth
 from densify.inputs import MapSource, check_unit, map_and_frames
-from densify.judging.withheld import Withheld, WithheldOfMap, withheld_errors
+from densify.judging.withheld import WithheldOfMap, withheld_errors
 from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.errors import InputError
@@ -225,8 +225,6 @@ def _made_dense(
             result.dense.write(folder / f"map_{map_id:03d}")
         judged = result.judgement
         if judged is not None and judged.hidden is not None:
-            bent = judged.blocks.constant_bent
-            constant = Withheld(judged.blocks.count, bent, float("inf"), 0.0, bent)
-            withheld.append(WithheldOfMap(map_id, judged.hidden, constant))
+            withheld.append(WithheldOfMap(map_id, judged.hidden, judged.hidden_constant))
     dense = {m.trajectory.id: m for m in (dense_models(read_run(folder)) if map_folders(folder) else [])}
     return [dense.get(m.trajectory.id, m) for m in sparse_models(sparse_map)], withheld

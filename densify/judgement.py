@@ -88,6 +88,7 @@ class Judge:
             Columns.of(drawn),
             Columns.of(images),
             Withheld.of_errors(np.concatenate([np.zeros(0), *delivered])),
+            Withheld.of_errors(np.concatenate([np.zeros(0), *(errors[:, 3] for errors in self._blocks.values())])),
             Withheld.of(dense, points),
             len(keyframes),
             sum(k.alignment.ok for k in keyframes),

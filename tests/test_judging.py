@@ -160,7 +160,7 @@ def test_a_bend_that_nothing_can_judge_is_undone():
 
 def known(**changes) -> Judgement:
     good = Columns(500, 0.03, 0.02, 0.2, 0.1)
-    made = Judgement(good, good, good, None, Withheld(500, 0.02, 0.1, 0.0, 0.02), 10, 10)
+    made = Judgement(good, good, good, surface=Withheld(500, 0.02, 0.1, 0.0, 0.02), keyframes=10, aligned=10)
     return replace(made, **changes)
 
 

@@ -34,6 +34,8 @@ class Judgement:
     """agreement with the images: distances by parallax, which nothing was fitted to"""
     hidden: Withheld | None = None
     """the points of `blocks` by what each keyframe was delivered with, its bend or one scale"""
+    hidden_constant: Withheld | None = None
+    """the same points by a constant distance, bent"""
     surface: Withheld | None = None
     """the delivered surface against distances by parallax; None where the images are silent"""
     keyframes: int = 0
@@ -76,6 +78,7 @@ class Judgement:
             "drawn": self.drawn.record(),
             "images": self.images.record(),
             "hidden": None if self.hidden is None else self.hidden.record(),
+            "hidden_constant": None if self.hidden_constant is None else self.hidden_constant.record(),
             "surface": told,
             "number": self.number if np.isfinite(self.number) else None,
             "bends_undone": self.undone,

@@ -103,20 +103,14 @@ class _Map(BaseModel):
     withheld_constant: _Withheld | None = None
 
 
-class _Blocks(BaseModel):
-    count: int
-    constant_bent: float | None
-
-
 class _Judge(BaseModel):
     hidden: _Withheld | None
-    blocks: _Blocks
+    hidden_constant: _Withheld | None = None
 
-    def read(self) -> tuple[Withheld, Withheld]:
+    def read(self) -> tuple[Withheld, Withheld | None]:
         """What hidden blocks say of the keyframes as they were delivered, and of a constant distance, bent."""
-        bent = np.inf if self.blocks.constant_bent is None else self.blocks.constant_bent
-        constant = Withheld(self.blocks.count, bent, np.inf, 0.0, bent)
-        return self.hidden.read() if self.hidden else Withheld(0, np.inf, np.inf, 0.0), constant
+        hidden = self.hidden.read() if self.hidden else Withheld(0, np.inf, np.inf, 0.0)
+        return hidden, None if self.hidden_constant is None else self.hidden_constant.read()
 
 
 class _Judged(BaseModel):
