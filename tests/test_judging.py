@@ -186,10 +186,10 @@ def test_the_verdict_has_a_colour_and_a_reason_with_figures(colour, sentence, ch
 def test_a_better_map_is_proposed_where_the_images_speak_against_it_and_only_there():
     bad, against = Columns(500, 0.07, 0.06, 0.1, 0.1), Columns(500, 0.03, 0.04, 0.1, 0.1)
     good, near, far = Columns(500, 0.03, 0.03, 0.1, 0.1), *(Withheld(500, m, 0.1, 0.0, m) for m in (0.02, 0.08))
-    assert proposal(Judgement(good, good, good, None, near, 10, 10)) == ""
-    assert "8.0%" in proposal(Judgement(good, good, good, None, far, 10, 10))
-    assert "--repair-map" in proposal(Judgement(bad, bad, against, None, near, 10, 10))
-    assert proposal(Judgement(bad, bad, against, None, None, 10, 10)) == ""  # silent images accuse nobody
+    assert proposal(Judgement(good, good, good, surface=near)) == ""
+    assert "8.0%" in proposal(Judgement(good, good, good, surface=far))
+    assert "--repair-map" in proposal(Judgement(bad, bad, against, surface=near))
+    assert proposal(Judgement(bad, bad, against)) == ""  # silent images accuse nobody
 
 
 def test_the_verdict_on_a_run_is_that_of_its_worst_map():
