@@ -77,7 +77,7 @@ class Alignment(Brief):
 
     `ok`, or else `reason` says why the keyframe is left out. `range_90` is the 90th percentile of the distance of the
     LMedS inliers. `bend` is the smooth field that the depth is bent by, where there is one; `unbent_because` says why
-    one that was found is not used.
+    what was found is not used, or only a part of it.
     """
 
     keyframe: str

@@ -210,9 +210,10 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
         if j.surface is not None:
             met = "" if j.surface.median_met is None else f" {100 * j.surface.median_met:.1f} % in the median;"
             text += f" The surface against the images:{met} {100 * j.surface.miss:.0f} % of their rays miss it."
-        undone = [a for a in result.dense.alignments if a.unbent_because]
-        if undone:
-            text += f" {len(undone)} keyframes keep one scale; {undone[0].keyframe}: {undone[0].unbent_because}."
+        braked = [a for a in result.dense.alignments if a.unbent_because]
+        if braked:
+            text += f" {j.undone} keyframes keep one scale, {j.lessened} a part of their bend; "
+            text += f"{braked[0].keyframe}: {braked[0].unbent_because}."
         page.text(text)
 
 

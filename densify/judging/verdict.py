@@ -42,6 +42,8 @@ class Judgement:
     aligned: int = 0
     undone: int = 0
     """keyframes whose bend was undone"""
+    lessened: int = 0
+    """keyframes that keep a part of their bend"""
     bends: float = 0.0
     """median size of the bends in deviations of their prior; 1 is usual"""
 
@@ -82,6 +84,7 @@ class Judgement:
             "surface": told,
             "number": self.number if np.isfinite(self.number) else None,
             "bends_undone": self.undone,
+            "bends_lessened": self.lessened,
             "bend_size": self.bends,
         }
 
