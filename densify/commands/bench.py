@@ -23,7 +23,6 @@ from densify.bench.scenes import Size, scenes
 from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, CellFigures, load_models, predicted, run_scene
 from densify.config import DensifyConfig, OfflineConfig, Recipe
-from densify.judging.config import JudgeConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
@@ -90,7 +89,7 @@ def run(
         recipes=recipes,
         cases=USUAL_CASES[size] if cases is None else cases,
         image_size=image_size or IMAGE_SIZE[size],
-        densify=DensifyConfig(**vars(method), judge=JudgeConfig(on=False)),
+        densify=DensifyConfig(**vars(method)),
     )
     models = load_models(checkpoints)
     with run_folder(output, "bench", arguments, overwrite) as folder:
