@@ -37,7 +37,8 @@ class LightDepth(pl.LightningModule):
 
     Args:
         network: Which network is trained.
-        loss: Weights of the loss terms, and the constants inside them.
+        loss: Weights of the loss terms (factors without a unit, times each term's mean over the pixels), and the
+            constants inside them.
         learning_rate: Learning rate of the optimiser AdamW at the top of the schedule, a number above 0. A larger one
             changes the weights more in every step: the network learns faster, and less steadily.
         weight_decay: Weight decay of AdamW: every step shrinks each weight by this number times the learning rate, as a

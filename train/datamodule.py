@@ -80,15 +80,16 @@ class FrameData:
     faster, as far as there are cores."""
     augment: bool = True
     """true: training images are flipped at random, and made brighter or darker by some 10 %. false: they are shown as
-    they are. Validation images always are."""
+    they are. Validation images are never changed."""
     reflectance_error: float = 0.0
     """Number added to the known reflectance of each image (the share of light that the wall throws back; the sum is
     kept in [0, 0.95]), to try what a wrong calibration costs; 0 adds nothing. A larger one makes it more wrong. Only
     --model.loss.reflectance null, or reflectance among --model.network.inputs, lets it have an effect."""
     random_reflectance: tuple[float, float] | None = None
-    """Range [low, high] of shares in [0, 1), from which the reflectance that is told of each training image (the share
-    of light that the wall throws back) is drawn anew in every step, so that a network with this input learns to obey
-    it. A larger one tells of more indirect light. Left out, the known reflectance is told."""
+    """Range [low, high] of shares in [0, 1), from which the reflectance told of each training image (the share of light
+    that the wall throws back) is drawn anew in every step; left out, the known one is told. A larger one tells of more
+    indirect light. Like reflectance_error, it acts through --model.loss.reflectance null or the network's input
+    alone."""
     seed: int = 0
     """Number that draws colons, order and augmentation. Another one makes another run."""
 

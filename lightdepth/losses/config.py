@@ -17,7 +17,8 @@ class LossConfig:
 
     photometric: float = 1.0
     """Weight of the main term of the loss: the difference between the light that is seen and that which the predicted
-    distance would give (`rendered`). A larger one makes distance follow brightness more closely; 0 leaves it out."""
+    distance would give (the rendered light). A larger one makes distance follow brightness more closely; 0 leaves it
+    out."""
     space: Literal["log", "encoded", "linear"] = "log"
     """What the photometric term compares: "log", the log of brightness (the largest of R, G and B); "encoded", RGB as
     the camera wrote it; "linear", RGB in proportion to light. With the last two the albedo (the wall's colour) has to
@@ -48,8 +49,8 @@ class LossConfig:
     """Weight of the changes of the predicted albedo (the wall's own colour) from pixel to pixel; 0 leaves it out. A
     larger one makes the albedo more even."""
     self_supervised: float = 1.0
-    """Weight of all terms above together, which need no truth; 0 leaves them out. A larger one counts them for more
-    against `supervised`, and without that changes next to nothing."""
+    """Factor on the weights from photometric to albedo, whose terms need no truth; 0 leaves them out. A larger one
+    counts them for more against `supervised`, and without that changes next to nothing."""
     supervised: float = 0.0
     """Weight of the term that compares with true distance, up to one factor per image; at 0, truth is not read for it.
     A larger one counts truth for more against the terms that need none."""

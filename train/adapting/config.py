@@ -60,8 +60,8 @@ class AdaptConfig:
     """Share of each sequence, above 0 and below 1, at its end, that judges and is never trained on. A larger one judges
     more surely and trains on less."""
     seed: int = 0
-    """Number that all chance follows from: order of frames, augmentation, replayed colons, blocks of wall that judge.
-    Another one makes another run, better or worse by chance alone."""
+    """Number that all chance follows from: order of frames, augmentation, replayed colons, blocks of wall that judge,
+    the beginning of low_rank. Another one makes another run, better or worse by chance alone."""
 
     def __post_init__(self) -> None:
         if min(self.steps, self.batch_size) < 1 or not self.learning_rate > 0 or self.replay < 0:

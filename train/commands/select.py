@@ -79,11 +79,12 @@ def select(
             covisible) is then read from it, by --map_rules, and no images are matched.
         matcher: What matches images where there is no --map: sift, by single features; loftr, by a network, which finds
             matches on smoother tissue, takes longer and needs --loftr.weights. Its options begin with its name.
-        format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
-            looking if left out.
+        format: Format of the frames: folder (images with camera.json), video, or the data set c3vd, simcol, hamlyn,
+            scared, endoslam or endomapper. Left out, it is told by the files.
         camera: Calibration file of the camera, used instead of the folder's own; left out, the folder's, else the
             map's.
-        mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
+        mask: Image, white where tissue shows and black elsewhere, used instead of the folder's own mask. Left out, the
+            folder's own, where it has one, else the whole image.
         with_folder: true: names are written as folder/name, so that lists of several sequences can be joined. false: as
             name alone.
         no_frames: Leave out all pictures: the sheet is not written, and the page has none. Without it, both show
