@@ -25,12 +25,15 @@ def predict(
     """Distance, albedo and normals of every frame of a sequence, as one .npz a frame.
 
     Args:
-        output: Folder to make, with one .npz for each frame.
-        checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
-        refine: Number of steps in which each image's distance is improved by its own light; 0 for none. More follow
-            the light further and take longer.
-        previews: Also write a PNG with image and distance for every frame.
-        overwrite: Replace a folder made before.
+        output: Folder to make, with one .npz for each frame: distance (up to scale), albedo and normals.
+        checkpoint: Depth model: a path (.safetensors or .ckpt) or a bundled name (lightdepth-synthetic or
+            lightdepth-self); decline, distance by formula from brightness alone; constant, the same distance
+            everywhere, to compare with.
+        refine: Number of steps in which the distance of each image is changed so that the light which it would give
+            comes closer to that which is seen; 0 for none. More follow the light further and take longer.
+        previews: true: a PNG with the image and its distance is written for every frame as well, into previews/. false:
+            none is.
+        overwrite: Replace a folder made before. Without it, a folder that is already there is refused.
     """
     arguments = recorded(source, output=output, checkpoint=checkpoint, refine=refine, previews=previews)
     model = load_model(checkpoint)
