@@ -57,7 +57,7 @@ def kept(tried: Mapping[str, Tried]) -> dict[str, Kept]:
     blocks = {name: _squared(t.by_map) for name, t in tried.items()}
     if not sum(map(len, blocks.values())):
         return dict.fromkeys(tried, Kept(0.0, "nothing that it was not fitted to can judge the bend"))
-    return {name: _by_blocks(*losses, tried[name].size) for name, losses in _losses(blocks).items()}
+    return {name: _by_blocks(losses[0], losses[1], tried[name].size) for name, losses in _losses(blocks).items()}
 
 
 def _least_within_error(squared: Mapping[str, np.ndarray]) -> dict[str, Kept]:
