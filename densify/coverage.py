@@ -26,14 +26,15 @@ class CoverageConfig:
     """When wall counts as seen well, and what is too small to mention."""
 
     views: int = 3
-    """Least number of keyframes that must have seen a piece of wall for it to count as seen well. More make that
-    claim stricter."""
+    """Least number of keyframes that must have seen a piece of wall for the report to call it seen well; the surface
+    stays as it is. More make less wall count as seen well."""
     weight: float = 1.0
-    """Least weight of all the looks at it together: a keyframe that looks straight at lit wall counts 1, a slanted,
-    dark, saturated or uncertain look less. A larger one makes the claim stricter."""
+    """Least sum of the weights of all looks at a piece of wall for it to be called seen well: a keyframe looking
+    straight at lit wall counts 1, a slanted, dark, saturated or uncertain look less. A larger one makes less wall count
+    as seen well."""
     min_voxels: float = 5.0
-    """Side of a square, in voxels, below whose area weakly seen patches and holes are not listed. A larger one lists
-    fewer."""
+    """Side of a square, in voxels: holes and weakly seen patches of a smaller area than its are not listed in the
+    report. A larger one lists fewer."""
 
 
 @dataclass(frozen=True)

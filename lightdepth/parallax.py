@@ -40,24 +40,27 @@ class ParallaxConfig:
     """How the images measure distance."""
 
     on: bool = True
-    """Whether distances measured between images judge the surface; switched off, only the map's points do."""
+    """Whether distances measured between the images of keyframes (by parallax) help to judge bends and surface;
+    switched off, only the map's points do."""
     width: int = 320
-    """Width that images are compared at, pixels; smaller ones stay. A larger one measures finer and takes longer."""
+    """Width to which wider images are shrunk before they are compared, pixels. A larger one measures finer and takes
+    longer."""
     across: int = 24
-    """Number of cells across the image, of each of which the pixel with most texture is tried. More give more
-    distances and take longer."""
+    """Number of cells across the image, and in proportion down; in each, the pixel with most texture is measured. More
+    give more distances and take longer."""
     neighbours: int = 4
-    """Number of keyframes that each is compared with. More make distances surer and take longer."""
+    """Largest number of other keyframes that each is compared with. More make distances surer and take longer."""
     patch: int = 7
-    """Side of the patches that are compared, pixels, an odd number. A larger one needs less texture and blurs edges."""
+    """Side of the square patches of image that are compared, pixels, an odd number. A larger one needs less texture and
+    blurs edges."""
     angle: float = 12.0
-    """Parallax that neighbours are chosen for, degrees between their rays to shared points. A larger one measures
-    finer, between images that look less alike."""
+    """Parallax preferred in the choice of those keyframes, degrees: the angle between both cameras' rays to a shared
+    point. A larger one measures distance more finely, between images that look less alike."""
     least_angle: float = 2.0
-    """Parallax below which a neighbour is not compared, degrees. A larger one leaves out more pairs."""
+    """Parallax below which two keyframes are not compared, degrees. A larger one leaves out more pairs."""
     least_score: float = 0.7
-    """Least correlation of a patch with its likeness, 1 at most, for its distance to count. A larger one gives fewer,
-    surer distances."""
+    """Least correlation, at most 1, of a patch with what the other keyframes show of it, for its distance to count. A
+    larger one gives fewer, surer distances."""
 
 
 @dataclass(frozen=True, repr=False)
