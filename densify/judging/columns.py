@@ -80,7 +80,11 @@ class FourWays:
 
     @classmethod
     def of(cls, view: View, method: Method) -> FourWays:
-        scale, bend = _aligned(view, method)
+        return cls.beside(*_aligned(view, method), view, method)
+
+    @classmethod
+    def beside(cls, scale: float, bend: Bend, view: View, method: Method) -> FourWays:
+        """A scale and a bend that are known already, and the constant's with the same points."""
         return cls(scale, bend, *_aligned(_constant(view), method))
 
     def errors(self, at: ObservedDistances) -> np.ndarray:
