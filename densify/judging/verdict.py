@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from densify.judging.columns import Columns
+from densify.judging.doubts import Doubts
 from densify.judging.withheld import Withheld
 
 Colour = Literal["green", "amber", "red"]
@@ -46,6 +47,8 @@ class Judgement:
     """keyframes that keep a part of their bend"""
     bends: float = 0.0
     """median size of the bends in deviations of their prior; 1 is usual"""
+    doubts: Doubts | None = None
+    """hidden points with the uncertainty that was predicted of them; None where the model predicts none"""
 
     @property
     def number(self) -> float:
@@ -86,6 +89,7 @@ class Judgement:
             "bends_undone": self.undone,
             "bends_lessened": self.lessened,
             "bend_size": self.bends,
+            "uncertainty": None if self.doubts is None else self.doubts.calibration.record(),
         }
 
 
