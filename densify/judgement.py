@@ -123,7 +123,10 @@ class Judge:
             one, bend = np.log(ratio[:, :2]).T
             for error, into in ((one, predicted), (one + self._share(k) * (bend - one), delivered)):
                 into.append(HiddenErrors(error, sigma, spread, *where))
-        return Doubts(tuple(predicted), tuple(delivered)) if predicted else None
+        # A map whose points err together would be called the model's error.
+        undone, aligned = sum(kept.share == 0 for kept in self._kept.values()), sum(k.alignment.ok for k in keyframes)
+        against = f"{undone} of {aligned} bends to the map's points had to be undone" if 2 * undone > aligned else ""
+        return Doubts(tuple(predicted), tuple(delivered), against) if predicted else None
 
     def _share(self, k: AlignedKeyframe) -> float:
         """Share of its bend that a keyframe was delivered with."""

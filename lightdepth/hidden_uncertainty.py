@@ -143,8 +143,10 @@ def _without_wrong(k: HiddenErrors, size: float, flat: float) -> HiddenErrors:
         if len(rows) > _NEIGHBOURS:
             apart, around = cKDTree(k.place[rows]).query(k.place[rows], _NEIGHBOURS + 1)
             near, errors = apart[:, 1:] < _AROUND, k.error[rows[around[:, 1:]]]
-            many = near.sum(1) >= 2
-            middle[rows[many]] = np.nanmedian(np.where(near, errors, np.nan)[many], axis=1)
+            # numpy.nanmedian takes a hundred times as long.
+            ordered, count = np.sort(np.where(near, errors, np.inf), axis=1), near.sum(1)
+            low, high = (np.take_along_axis(ordered, (m // 2)[:, None], 1)[:, 0] for m in (count - 1, count))
+            middle[rows] = np.where(count >= 2, (low + high) / 2, np.nan)
     usual = np.maximum(size * _filled(k.spread), flat)
     stays = ~(np.abs(k.error - middle) > _STICKS_OUT * usual)
     return HiddenErrors(*(getattr(k, name)[stays] for name in HiddenErrors.__dataclass_fields__))

@@ -145,6 +145,9 @@ def test_densify_says_how_far_a_boastful_model_is_to_be_believed(frames):
     assert found.delivered.factor < found.predicted.factor
     assert judgement.record()["uncertainty"]["predicted"]["factor"] == found.predicted.factor
     assert calibrated_together([None, judgement.doubts]) == found
+    distrusted = replace(judgement.doubts, against="the map is wrong")
+    assert calibrated_together([distrusted, judgement.doubts]) == found
+    assert str(calibrated_together([distrusted])) == "not calibrated: the map is wrong"
 
 
 def test_a_model_that_predicts_none_has_none_to_calibrate(frames):

@@ -7,7 +7,7 @@ uncertainty is meant for; and on that of the depth as it was delivered, bent to 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -25,11 +25,14 @@ class Doubts:
     """errors at one scale for each keyframe"""
     delivered: tuple[HiddenErrors, ...]
     """errors as delivered, by bend or scale"""
+    against: str = ""
+    """why the map is no judge of the uncertainty; empty where nothing speaks against it"""
 
     @cached_property
     def calibration(self) -> DoubtsCalibrated:
         """What they say of the uncertainty."""
-        return DoubtsCalibrated(calibrated(self.predicted), calibrated(self.delivered))
+        found = calibrated(self.predicted), calibrated(self.delivered)
+        return DoubtsCalibrated(*(replace(c, reason=c.reason or self.against) for c in found))
 
 
 @dataclass(frozen=True)
@@ -51,8 +54,9 @@ class DoubtsCalibrated:
 
 
 def calibrated_together(doubts: Sequence[Doubts | None]) -> DoubtsCalibrated | None:
-    """Of several submaps together; None where none has a predicted uncertainty."""
+    """Of several submaps together, where nothing speaks against them; None where none has a predicted uncertainty."""
     known = [d for d in doubts if d is not None]
+    known = [d for d in known if not d.against] or known[:1]
     if len(known) < 2:
         return known[0].calibration if known else None
     predicted = tuple(k for d in known for k in d.predicted)
