@@ -26,8 +26,8 @@ class AheadConfig:
     """Whether a live surface is held against the points that come after it."""
 
     on: bool = True
-    """Whether each keyframe's new points judge the depth that was fused before; switched off, there is no verdict, and
-    a keyframe takes a little less time."""
+    """true: the points that a keyframe is the first to observe judge the depth of the last aligned keyframe before it,
+    and the run has a verdict. false: it has none, and a keyframe takes up to a tenth less time."""
 
 
 @dataclass(frozen=True)
