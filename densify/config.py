@@ -12,6 +12,7 @@ from densify.contradiction import ContradictionConfig
 from densify.coverage import CoverageConfig
 from densify.fusion.rectify import RectifyConfig
 from densify.fusion.volume import FusionConfig
+from densify.judging.ahead import AheadConfig
 from densify.judging.config import JudgeConfig
 from lightdepth.errors import InputError
 
@@ -59,6 +60,8 @@ class LiveConfig(MethodConfig):
     """resolution and reach of the surface"""
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
     """when wall counts as seen well"""
+    judge: AheadConfig = field(default_factory=AheadConfig)
+    """whether points that come later judge the surface (--judge.on false leaves that out)"""
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def live(
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
         run.hash_inputs(**source.files, map=mapped.map)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
-        result = PlayedRun(run, config.coverage, mm_per_unit)
+        result = PlayedRun(run, config.coverage, mm_per_unit, config.judge.on)
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:
             played = play(frames, sparse_map, model, config, result.add, rate, lambda _: bar.advance())
         result.finish(played, model.name, rate, budget_ms)
