@@ -35,7 +35,7 @@ class CoverageConfig:
     straight at lit wall counts 1, a slanted, dark, saturated or uncertain look less. A larger one makes less wall count
     as seen well."""
     error: float = DOUBTED
-    """Largest error that may be expected of a vertex, as a share of a typical distance between keyframes and points. A
+    """Largest error that may be expected of a vertex, as a share of the distance of a typical inlier. A
     larger one calls more wall seen well, and more of it is wrong."""
     min_voxels: float = 5.0
     """Side of a square, in voxels: holes and weakly seen patches of a smaller area than its are not listed in the
@@ -100,7 +100,7 @@ def seen_well(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> np.
     assert dense.weights is not None and dense.views is not None
     well: np.ndarray = (dense.views >= config.views) & (dense.weights >= config.weight)
     if dense.expected_error is not None:
-        well &= dense.expected_error <= config.error * dense.typical_distance
+        well &= dense.expected_error <= config.error * dense.inlier_distance
     return well
 
 

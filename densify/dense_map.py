@@ -20,11 +20,11 @@ from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.schema import read_json
 from lightdepth.files.tum import read_tum, write_tum
-from lightdepth.sparse_map import Keyframe, Submap, typical_distance
+from lightdepth.sparse_map import Keyframe, Submap
 
 GREEN, RED, GREY = (0, 170, 60), (220, 30, 30), (150, 150, 150)
-DOUBTED = 0.033
-"""Expected error of a vertex, as a share of a typical distance, at which its confidence is one half."""
+DOUBTED = 0.03
+"""Expected error of a vertex, as a share of the distance of a typical inlier, at which its confidence is one half."""
 
 
 class Surface:
@@ -118,13 +118,19 @@ class DenseMap(Brief):
         """In [0, 1): 1 / (1 + e²), e being a vertex's expected error in units of what is doubted, so that one half is
         where doubt begins. Where no error is expected for want of a map, w / (1 + w) of its weight w."""
         if self.expected_error is not None:
-            return 1 / (1 + (self.expected_error / (DOUBTED * self.typical_distance)) ** 2)
+            return 1 / (1 + (self.expected_error / (DOUBTED * self.inlier_distance)) ** 2)
         return None if self.weights is None else self.weights / (1 + self.weights)
 
     @cached_property
-    def typical_distance(self) -> float:
-        """From its keyframes to the points that they observed."""
-        return typical_distance(self.submap)
+    def inlier_distance(self) -> float:
+        """A typical distance from aligned keyframes to their inliers: the median of their medians, which wrong points
+        do not change."""
+        medians = []
+        for keyframe, alignment in zip(self.submap.keyframes, self.alignments, strict=True):
+            rows, held = self.submap.rows_of(alignment.inlier_ids)
+            if alignment.ok and held.any():
+                medians.append(np.median(np.linalg.norm(keyframe.in_camera(self.submap.points[rows[held]]), axis=1)))
+        return float(np.median(medians))
 
     @property
     def aligned(self) -> list[Alignment]:

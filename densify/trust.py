@@ -28,7 +28,7 @@ _SIGMA = 0.1  # of log distance, where a model does not say how uncertain it is
 _EVERY = 8  # pixels; uncertainty is smooth
 _HIDDEN = 3.0  # voxels by which a surface may lie before a vertex and still be the vertex's own
 _LEAST_LOOKS = 0.05
-_FARTHEST = 2.0  # typical distances, beyond which nothing is less known
+_FARTHEST = 2.0  # typical distances of inliers, beyond which nothing is less known
 
 
 def coarse_sigma(prediction: DepthPrediction) -> np.ndarray | None:
@@ -53,11 +53,11 @@ def expected_error(dense: DenseMap, sigmas: Mapping[str, np.ndarray]) -> np.ndar
     places, normals = dense.vertices[some], vertex_normals(dense.vertices, dense.triangles)[some]
     gap, around = cKDTree(points).query(places, min(_AROUND, len(points)))
     gap, around = gap.reshape(len(places), -1), around.reshape(len(places), -1)
-    most = _FARTHEST * dense.typical_distance
+    most = _FARTHEST * dense.inlier_distance
     reach = gap[:, : _AROUND // 2][:, -1].clip(max=most)
     met = np.median(dense.surface.distance(points)[around], 1)
     looks, unsure = _looks(dense, places, normals, sigmas, most)
-    least = 1e-3 * dense.typical_distance
+    least = 1e-3 * dense.inlier_distance
     error = np.sqrt((0.65 * met) ** 2 + (0.055 * reach) ** 2 + (0.15 * unsure) ** 2 + least**2)
     error *= 1 + 0.65 / looks.clip(min=_LEAST_LOOKS)
     return _between(places, error, dense.vertices, dense.voxel)
