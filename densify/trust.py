@@ -22,12 +22,13 @@ from scipy.spatial import cKDTree
 from densify.dense_map import DenseMap
 from lightdepth.prediction import DepthPrediction
 
-_CELL = 3.0  # voxels; one vertex of each cell is looked at, and the others follow: errors change slowly along the wall
+_CELL = 4.0  # voxels; one vertex of each cell is looked at, and the others follow: errors change slowly along the wall
 _AROUND = 12  # inliers that are asked how far they are from the surface; half as far reaches g
 _SIGMA = 0.1  # of log distance, where a model does not say how uncertain it is
 _EVERY = 8  # pixels; uncertainty is smooth
 _HIDDEN = 3.0  # voxels by which a surface may lie before a vertex and still be the vertex's own
 _LEAST_LOOKS = 0.05
+_SMOOTH = 4  # neighbouring cells, itself among them, whose geometric mean a cell is given
 _FARTHEST = 2.0  # typical distances of inliers, beyond which nothing is less known
 
 
@@ -49,8 +50,11 @@ def expected_error(dense: DenseMap, sigmas: Mapping[str, np.ndarray]) -> np.ndar
     points = dense.submap.points[dense.judged_points()[1]]
     if not len(dense.triangles) or not len(points):
         return None
-    some = _one_in_each_cell(dense.vertices, _CELL * dense.voxel)
-    places, normals = dense.vertices[some], vertex_normals(dense.vertices, dense.triangles)[some]
+    some, cell = _one_in_each_cell(dense.vertices, _CELL * dense.voxel)
+    chosen = np.zeros(len(dense.vertices), bool)
+    chosen[some] = True
+    own = dense.triangles[chosen[dense.triangles].any(1)]
+    places, normals = dense.vertices[some], vertex_normals(dense.vertices, own)[some]
     gap, around = cKDTree(points).query(places, min(_AROUND, len(points)))
     gap, around = gap.reshape(len(places), -1), around.reshape(len(places), -1)
     most = _FARTHEST * dense.inlier_distance
@@ -60,7 +64,10 @@ def expected_error(dense: DenseMap, sigmas: Mapping[str, np.ndarray]) -> np.ndar
     least = 1e-3 * dense.inlier_distance
     error = np.sqrt((0.65 * met) ** 2 + (0.055 * reach) ** 2 + (0.15 * unsure) ** 2 + least**2)
     error *= 1 + 0.65 / looks.clip(min=_LEAST_LOOKS)
-    return _between(places, error, dense.vertices, dense.voxel)
+    beside = cKDTree(places).query(places, min(_SMOOTH, len(places)))[1].reshape(len(places), -1)
+    smooth = np.exp(np.log(error)[beside].mean(1))
+    result: np.ndarray = smooth[cell]
+    return result
 
 
 def _looks(
@@ -97,23 +104,15 @@ def _sigma_at(sigma: np.ndarray | None, pixels: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(found), found, _SIGMA)
 
 
-def _one_in_each_cell(vertices: np.ndarray, side: float) -> np.ndarray:
-    """Rows of vertices (n, 3), one for each cube of a grid that has any."""
-    cells = np.floor(vertices / side).astype(np.int64)
+def _one_in_each_cell(vertices: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (m,) of vertices (n, 3), one for each cube of a grid that has any; and which of these is whose (n,)."""
+    # Aside, because vertices lie on edges of voxels: on the border of two cubes, rounding would choose.
+    cells = np.floor(vertices / side + 0.377).astype(np.int64)
     cells -= cells.min(0)
     size = cells.max(0) + 1
-    result: np.ndarray = np.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_index=True)[1]
-    return result
-
-
-def _between(places: np.ndarray, values: np.ndarray, wanted: np.ndarray, blur: float) -> np.ndarray:
-    """Positive values at wanted (n, 3) from those at places (m, 3): of the nearest four, in the geometric mean, the
-    nearer the more."""
-    distance, row = cKDTree(places).query(wanted, min(4, len(places)))
-    distance, row = distance.reshape(len(wanted), -1), row.reshape(len(wanted), -1)
-    weight = 1 / (distance + blur)
-    result: np.ndarray = np.exp((weight * np.log(values)[row]).sum(1) / weight.sum(1))
-    return result
+    names = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    _, first, cell = np.unique(names, return_index=True, return_inverse=True)
+    return first, cell
 
 
 def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
