@@ -124,13 +124,13 @@ class DenseMap(Brief):
     @cached_property
     def inlier_distance(self) -> float:
         """A typical distance from aligned keyframes to their inliers: the median of their medians, which wrong points
-        do not change."""
+        do not change; 0 without any."""
         medians = []
         for keyframe, alignment in zip(self.submap.keyframes, self.alignments, strict=True):
             rows, held = self.submap.rows_of(alignment.inlier_ids)
             if alignment.ok and held.any():
                 medians.append(np.median(np.linalg.norm(keyframe.in_camera(self.submap.points[rows[held]]), axis=1)))
-        return float(np.median(medians))
+        return float(np.median(medians)) if medians else 0.0
 
     @property
     def aligned(self) -> list[Alignment]:
