@@ -99,7 +99,7 @@ def seen_well(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> np.
     """Which vertices (n,) were seen well."""
     assert dense.weights is not None and dense.views is not None
     well: np.ndarray = (dense.views >= config.views) & (dense.weights >= config.weight)
-    if dense.expected_error is not None:
+    if dense.expected_error is not None and dense.aligned:
         well &= dense.expected_error <= config.error * dense.inlier_distance
     return well
 

@@ -117,7 +117,7 @@ class DenseMap(Brief):
     def confidence(self) -> np.ndarray | None:
         """In [0, 1): 1 / (1 + e²), e being a vertex's expected error in units of what is doubted, so that one half is
         where doubt begins. Where no error is expected for want of a map, w / (1 + w) of its weight w."""
-        if self.expected_error is not None:
+        if self.expected_error is not None and self.aligned:
             return 1 / (1 + (self.expected_error / (DOUBTED * self.inlier_distance)) ** 2)
         return None if self.weights is None else self.weights / (1 + self.weights)
 
@@ -170,7 +170,7 @@ class DenseMap(Brief):
             if suffix == "ply" and self.confidence is not None and self.views is not None and len(self.vertices):
                 mesh.vertex_attributes["confidence"] = self.confidence.astype(np.float32)
                 mesh.vertex_attributes["views"] = self.views.astype(np.int32)
-                if self.expected_error is not None:
+                if self.expected_error is not None and self.aligned:
                     mesh.vertex_attributes["expected_error"] = (self.expected_error * scale).astype(np.float32)
             mesh.export(folder / f"mesh.{suffix}")
         normals = mesh.vertex_normals if len(self.vertices) else np.zeros((0, 3))
