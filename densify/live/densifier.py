@@ -21,8 +21,8 @@ import numpy as np
 from densify.aligned import AlignedKeyframe, align_alone, align_together
 from densify.alignment import Alignment
 from densify.config import DensifyConfig, LiveConfig, MethodConfig
-from densify.coverage import contribution, with_contributions
-from densify.dense_map import Contribution, DenseMap
+from densify.coverage import Given, with_contributions
+from densify.dense_map import DenseMap
 from densify.fusers import view_to_fuse
 from densify.fusion.marching_cubes import unpacked
 from densify.fusion.patches import BlockSurface, Patch, joined
@@ -82,7 +82,7 @@ class _Kept:
     """its image and prediction, packed"""
     alignment: Alignment
     """how it was aligned when it was fused"""
-    given: Contribution | None = None
+    given: Given | None = None
     """what it gave to the surface; None where it was not fused"""
 
 
@@ -124,7 +124,9 @@ class Densifier:
     def kept_bytes(self) -> int:
         """Memory taken by what is kept of the keyframes."""
         parts = ((k.view.size, k.points, k.keyframe.pixels, k.keyframe.point_ids) for k in self._kept.values())
-        return sum(size + sum(array.nbytes for array in arrays) for size, *arrays in parts)
+        sigmas = (k.given.sigma for k in self._kept.values() if k.given is not None)
+        kept = sum(size + sum(array.nbytes for array in arrays) for size, *arrays in parts)
+        return kept + sum(sigma.nbytes for sigma in sigmas if sigma is not None)
 
     def warm_up(self, camera: CameraModel) -> None:
         """Does once, for a camera, what the first keyframe would otherwise wait for: tables, libraries' first calls."""
@@ -328,7 +330,7 @@ class Densifier:
             if view is None:
                 prediction = kept.view.prediction() if prediction is None else prediction
                 view = self._view(kept, prediction)
-                given = contribution(view, prediction)
+                given = Given.of(view, prediction)
             if self._volume is None:
                 self._volume = TsdfVolume(self._voxel(kept), self.config.fusion)
             self._changed.append(self._volume.integrate(view, kept.keyframe.cam_from_map))
