@@ -192,7 +192,7 @@ def _maps(
         frames, maps = asked.source.sequence(folder).open(), read_models(judged, asked.trajectory)
         check_truth(frames, asked.config.trust_truth)
         return frames, maps, withheld_errors(judged) if asked.suite else []
-    mapped = MapSource(asked.config.trust_map, judged)
+    mapped = MapSource(trust_map=asked.config.trust_map, map=judged)
     sparse_map, frames = map_and_frames(out, asked.source.sequence(folder), mapped, SfmConfig())
     if asked.suite:
         out.record.setdefault("pairings", {})[name] = out.record.pop("pairing")

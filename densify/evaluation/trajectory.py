@@ -19,7 +19,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
 from lightdepth.frame import frame_number
 from lightdepth.maps import read_trajectory
-from lightdepth.maps.convention import EXPORTER, declared_convention, frame_names
+from lightdepth.maps.convention import EXPORTER, declared_convention
 from lightdepth.maps.endocartoscope import MAPS, TRAJECTORIES, TRAJECTORY_FILE
 from lightdepth.maps.tum import is_trajectory
 from lightdepth.sparse_map import Submap
@@ -112,7 +112,7 @@ def _read(file: Path) -> Trajectory:
         whole = not all(keyframe)
     else:
         times, map_from_cam = read_tum(file)
-        numbers = [frame_number(n) + convention.frame_offset for n in frame_names(times, convention.fps, file)]
+        numbers = [frame_number(n) + convention.frame_offset for n in convention.clock.names(times, file)]
         centers = list(map_from_cam[:, :3, 3])
         keyframe, whole = [True] * len(numbers), "keyframe" not in file.name.lower()
     if not numbers:
