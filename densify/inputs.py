@@ -17,6 +17,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import Frame, check_image_size
 from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
+from lightdepth.maps.convention import MapReading
 from lightdepth.models import ConstantModel, DepthModel
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
@@ -34,6 +35,21 @@ class MapSource(PairingConfig):
     repair_map: bool = False
     """Make the map anew from the images of its keyframes before it is used, beginning at its poses, and keep its frame
     and scale; written to sparse/ in the run folder."""
+
+    @classmethod
+    def read_as(cls, map: Path, reading: MapReading, trust_map: bool = False, repair_map: bool = False) -> MapSource:
+        """A map that is read as was said elsewhere."""
+        return cls(
+            trust_map,
+            map,
+            repair_map,
+            map_folder=reading.map_folder,
+            map_sensor=reading.map_sensor,
+            frame_offset=reading.frame_offset,
+            map_fps=reading.map_fps,
+            time_offset=reading.time_offset,
+            time_tolerance=reading.time_tolerance,
+        )
 
 
 def map_and_frames(

@@ -28,7 +28,7 @@ def data(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("brought") / "seq"
     argv = ["--frames", COUNT, "--size", "[96, 80]", "--travel-mm", 10, "--lens", "pinhole"]
     assert lightdepth("synth", "-o", folder, *argv, "--slam.keyframe-every", 1, "--slam.maps", 1, *SMALL) == 0
-    shutil.rmtree(folder / "truth")  # its times would stand in for a rate
+    shutil.move(folder / "truth", folder.parent / "truth")  # its times would stand in for a rate
     return folder
 
 
@@ -152,6 +152,38 @@ def test_a_trajectory_in_unix_seconds_meets_frames_that_count_from_0(data, subma
         options = ["--map-fps", 25]
     found = met(frames, out, *options)
     assert {n: r[1] for n, r in found.items()} == {n: r[1] for n, r in plain.items()}
+
+
+def test_a_trajectory_beside_its_map_is_judged_on_any_clock(data, submap, tmp_path):
+    shutil.copytree(data, tmp_path / "true")
+    shutil.copytree(data.parent / "truth", tmp_path / "true" / "truth")
+    found = []
+    for name, clock in (("video", 0.0), ("unix", UNIX)):
+        as_installed(submap, tmp_path / name, clock)
+        for judged in (tmp_path / name, tmp_path / name / "frame_trajectory.txt"):
+            out = tmp_path / f"{name}_{judged.stem}_judged"
+            assert lightdepth("evaluate", judged, "--truth", tmp_path / "true", "-o", out) == 0
+            (row,) = json.loads((out / "metrics.json").read_text())["maps"]
+            found.append((row["poses"], row["rms_ate_mm"]))
+    assert found[0][0] == COUNT and all(row == pytest.approx(found[0], rel=1e-3) for row in found), found
+
+
+def test_known_poses_by_time_are_those_of_the_frames_at_these_times(data, submap, tmp_path):
+    trajectory(submap, tmp_path / "poses.txt", lambda n: n / 30)
+    argv = ["--poses", tmp_path / "poses.txt", "--map-fps", 30, "-o", tmp_path / "mapped"]
+    assert lightdepth("sparse", data, *argv) == 0
+    (found,) = read_map(tmp_path / "mapped" / "sparse").submaps
+    by_number = {k.number: k for k in submap.keyframes}
+    assert all(np.allclose(k.center, by_number[k.number].center, atol=1e-5) for k in found.keyframes)
+
+
+def test_a_map_that_counts_from_1_is_told_what_helps_and_it_helps(data, submap, plain, tmp_path, capsys):
+    later = tuple(replace(k, name=f"{k.number + 1:06d}.png") for k in submap.keyframes)
+    write_text_model(replace(submap, keyframes=later), tmp_path / "model")
+    argv = ["densify", data, "--map", tmp_path / "model", "--checkpoint", "decline", "-o", tmp_path / "run"]
+    assert lightdepth(*argv) == 3
+    assert "every keyframe is 1 frame earlier; add -1 to --frame-offset" in capsys.readouterr().err
+    assert met(data, tmp_path / "model", "--frame-offset", -1) == plain
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,9 @@ class MapReading:
     map_sensor: int | None = None
     """Number of the map's camera whose keyframes are taken, where it holds several, such as a stereo rig's left one.
     Another one takes the keyframes of another camera."""
+    frame_offset: int = 0
+    """Number of frames added to a keyframe's number, where the map counts from elsewhere: -1 where it counts from 1 and
+    the frames from 0. More make later frames of the keyframes."""
     map_fps: float | None = None
     """Number of frames per second by which the map's times are counted; it wins over the map's own. A higher one makes
     later frames of them."""
@@ -119,6 +122,7 @@ class MapReading:
 
     def over(self, convention: MapConvention) -> MapConvention:
         """The convention, with what was said here."""
+        convention = replace(convention, frame_offset=convention.frame_offset + self.frame_offset)
         said = {
             "folder": self.map_folder,
             "sensor": self.map_sensor,

@@ -172,6 +172,15 @@ def _time(entry: Mapping[Any, Any], where: str) -> float:
     return float(_numbers({"ts": [_field(entry, "ts", where)]}, "ts", 1, where)[0])
 
 
+def declared_rate(path: Path) -> float | None:
+    """Frames per second of a map's only camera; None where it does not tell one."""
+    section = _content(path).get("cameras")
+    entries = section.values() if isinstance(section, dict) else ()
+    rates = {entry.get("fps") for entry in entries if isinstance(entry, dict)}
+    known = [rate for rate in rates if isinstance(rate, int | float) and rate > 0]
+    return float(known[0]) if len(known) == 1 else None
+
+
 def first_stamp(path: Path) -> float | None:
     """The first time of a map's keyframes; None where it tells none."""
     entries = _content(path).get("keyframes")

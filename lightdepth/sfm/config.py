@@ -48,6 +48,9 @@ class SfmConfig:
     alike: int = 5
     """Number of frames matched with each besides, when sequential: those farther off that look most alike. More close
     more loops and take longer."""
+    mapper: Literal["incremental", "global", "both"] = "both"
+    """What places the matched frames: incremental, one after the other; global, all at once (GLOMAP); both, global
+    for those that incremental left, as submaps of their own."""
     min_model_size: int = 3
     """Least number of frames in a submap. More leave out small submaps."""
     min_points: int = 8
