@@ -13,6 +13,7 @@ from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
+from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, check_image_size
 from lightdepth.light.fit_on_map import fit_assumed_light
@@ -62,6 +63,7 @@ def map_and_frames(
         frames = source.open()
         return made_sparse(run, frames, sfm), frames
     sparse_map, frames = open_with_map(source, mapped.map, mapped)
+    sparse_map = by_the_images(sparse_map, frames)
     map_camera = sparse_map.submaps[0].keyframes[0].camera
     check_shared_frames(sparse_map, frames)
     _say_localised(run, sparse_map, frames)

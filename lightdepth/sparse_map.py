@@ -71,6 +71,8 @@ class Submap(Brief):
     origin, where single precision would have no digits left for its shape."""
     localised: tuple[int, ...] | None = None
     """Numbers of the frames whose place the map's SLAM knew, keyframes or not; None where nothing tells."""
+    guessed_clock: bool = False
+    """True when keyframes are counted from a clock's first stamp, which was taken for the first frame."""
 
     def __post_init__(self) -> None:
         if not len(self.points):

@@ -151,8 +151,29 @@ class Clock:
         if stamped and (self.fps is None or self._same_clock(times)):
             return self._by_stamp(times, where, begun)
         assert self.fps is not None
-        offset = self._offset(times, where, begun, 0.0, times.min() > _FOREIGN)
+        offset = self._offset(times, where, begun, 0.0)
         return _unique(self._counted((times - offset) * self.fps, times, where), where)
+
+    def guesses(self, times: np.ndarray) -> bool:
+        """Whether `names` takes the first stamp for the first frame, because the times are of another clock."""
+        times = np.asarray(times, np.float64)
+        stamped = self.frames is not None and len(self.frames.known[0]) > 0
+        if self.time_offset is not None or (self.fps is None and (not stamped or (times == np.rint(times)).all())):
+            return False
+        if stamped and (self.fps is None or self._same_clock(times)):
+            return self._no_frames_at(times)
+        return bool(times.min() > _FOREIGN)
+
+    def _no_frames_at(self, times: np.ndarray) -> bool:
+        """Whether none of the times lies within those of the frames."""
+        assert self.frames is not None
+        first, last = self.frames.known[1][[0, -1]]
+        return not ((times >= first - self._tolerance) & (times <= last + self._tolerance)).any()
+
+    @property
+    def _tolerance(self) -> float:
+        assert self.frames is not None
+        return self.time_tolerance if self.time_tolerance is not None else 0.5 * self.frames.step + 1e-6
 
     def _same_clock(self, times: np.ndarray) -> bool:
         """Whether the frames are stamped by the same clock of no video, such as Unix time: then stamps say more than
@@ -174,10 +195,8 @@ class Clock:
 
     def _by_stamp(self, times: np.ndarray, where: Path | str, begun: tuple[float, str] | None) -> list[str]:
         assert self.frames is not None
-        tolerance = self.time_tolerance if self.time_tolerance is not None else 0.5 * self.frames.step + 1e-6
-        first, last = self.frames.known[1][[0, -1]]
-        foreign = not ((times >= first - tolerance) & (times <= last + tolerance)).any()
-        offset = self._offset(times, where, begun, float(first), foreign)
+        tolerance = self._tolerance
+        offset = self._offset(times, where, begun, float(self.frames.known[1][0]))
         numbers, off = self.frames.nearest(times - offset)
         near = off <= tolerance
         if 2 * near.sum() < len(times):
@@ -192,18 +211,16 @@ class Clock:
         found = zip(numbers.tolist(), near.tolist(), (times - offset).tolist(), strict=True)
         return _unique([f"{n:06d}.png" if ok else f"{abs(t):.6f}s.png" for n, ok, t in found], where)
 
-    def _offset(
-        self, times: np.ndarray, where: Path | str, begun: tuple[float, str] | None, first: float, foreign: bool
-    ) -> float:
+    def _offset(self, times: np.ndarray, where: Path | str, begun: tuple[float, str] | None, first: float) -> float:
         """What the clock shows at the time 0 of the frames, the first of which is at `first`; said where it is
         found."""
-        if self.time_offset is not None or not foreign:
+        if not self.guesses(times):
             return self.time_offset or 0.0
         stamp, of = begun if begun is not None and begun[0] <= times.min() else (float(times.min()), "the map")
         warnings.warn(
             f"{where}: times are of another clock than the frames' (they begin at {stamp:.3f} s): the first stamp of "
-            f"{of} is taken for the first frame. Where tracking began later, say what the clock shows at the time 0 of "
-            f"the frames: --time-offset, here {stamp - first:.3f}",
+            f"{of} is taken for the first frame. Where tracking began later and the images do not tell, say what the "
+            f"clock shows at the time 0 of the frames: --time-offset, here {stamp - first:.3f}",
             stacklevel=2,
         )
         return stamp - first

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 import trimesh
 from test_cli import SMALL, lightdepth
+from test_sfm import PINHOLE, aligned, film, pose
 
+from lightdepth.datasets import write_folder
 from lightdepth.files.tum import write_tum
 from lightdepth.maps import read_map, write_stella, write_text_model
 from lightdepth.sparse_map import Submap
@@ -96,6 +98,18 @@ def test_a_clock_that_began_before_the_first_keyframe_is_told_by_the_trajectory_
     (tmp_path / "out" / "frame_trajectory.txt").unlink()
     (tmp_path / "out" / "densify_map.json").write_text(json.dumps({"time_offset": UNIX}))
     assert met(data, tmp_path / "out") == right
+
+
+def test_where_nothing_tells_when_a_clock_began_the_images_do(data, submap, tmp_path):
+    late = Submap(0, submap.keyframes[2:], submap.point_ids, submap.points)
+    as_installed(late, tmp_path / "out", UNIX)
+    for file in tmp_path.glob("out/*.txt"):
+        file.unlink()
+    argv = ["--map", tmp_path / "out", "--checkpoint", "decline", "--judge.on=false", "--no-fit-light"]
+    with pytest.warns(UserWarning, match="by the images tracking began 2 frames later"):
+        assert lightdepth("densify", data, *argv, "-o", tmp_path / "run") == 0
+    rows = (tmp_path / "run" / "map_000" / "keyframes.csv").read_text().splitlines()[1:]
+    assert [int(row.split(",")[1]) for row in rows] == list(range(2, COUNT))
 
 
 @pytest.mark.parametrize("places", [("a.msg", "b.msg"), ("0/map.msg", "1/map.msg")])
@@ -294,12 +308,11 @@ def climb(submap: Submap, folder: Path, first: int = 1) -> Path:
 
 def test_a_climb_submission_is_read_as_it_is_by_the_frames_camera(data, submap, tmp_path):
     tree = climb(submap, tmp_path / "submitted")
-    for at in (tree, tree / "1"):
-        with pytest.warns(UserWarning, match="counts frames from 1"):
-            found = met(data, at)
-        keyframes = [name for name, row in found.items() if row[1] == "1"]
-        assert keyframes[0] == "000000" and 2 <= len(keyframes) <= COUNT
-    argv = ["--map", tree, "--checkpoint", "decline", "--judge.on=false", "--no-fit-light", "--trust-map"]
+    with pytest.warns(UserWarning, match="counts frames from 1"):
+        found = met(data, tree)
+    keyframes = [name for name, row in found.items() if row[1] == "1"]
+    assert keyframes[0] == "000000" and 2 <= len(keyframes) <= COUNT
+    argv = ["--map", tree / "1", "--checkpoint", "decline", "--judge.on=false", "--no-fit-light", "--trust-map"]
     assert lightdepth("densify", data, *argv, "-o", tmp_path / "run") in (0, 4)
     localised = json.loads((tmp_path / "run" / "run.json").read_text())["localised"]["1"]
     assert localised["localised"] == localised["frames"] == COUNT and localised["keyframes"] == len(keyframes)
@@ -308,3 +321,23 @@ def test_a_climb_submission_is_read_as_it_is_by_the_frames_camera(data, submap, 
 def test_a_climb_submission_that_counts_as_the_frames_do_is_left_as_it_is(data, submap, tmp_path, recwarn):
     found = met(data, climb(submap, tmp_path / "submitted", first=0))
     assert found["000000"][1] == "1" and not any("counts frames from 1" in str(w.message) for w in recwarn)
+
+
+# ---- sparse, by another mapper
+
+
+@pytest.mark.parametrize("how", ["chosen", "second"])
+def test_the_global_mapper_is_a_choice_and_takes_what_the_incremental_one_left(tmp_path, how):
+    frames = film(PINHOLE, 6)
+    write_folder([replace(f, name=f"{f.number:06d}") for f in frames], tmp_path / "film")
+    # No two images have so many matches: the incremental mapper finds no beginning.
+    argv = ["--sfm.mapper", "global"] if how == "chosen" else ["--sfm.init_min_num_inliers", 100_000]
+    assert lightdepth("sparse", tmp_path / "film", *argv, "-o", tmp_path / "mapped") == 0
+    (found,) = read_map(tmp_path / "mapped" / "sparse").submaps
+    true = np.stack([pose(k.number - 10)[:3, 3] for k in found.keyframes])
+    scale, rotation, shift = aligned(np.stack([k.center for k in found.keyframes]), true)
+    away = [np.linalg.norm(scale * rotation @ k.center + shift - t) for k, t in zip(found.keyframes, true, strict=True)]
+    assert len(found.keyframes) == 6 and max(away) < 0.2
+    if how == "second":
+        argv += ["--sfm.mapper", "incremental"]
+        assert lightdepth("sparse", tmp_path / "film", *argv, "-o", tmp_path / "none") == 3

@@ -11,6 +11,7 @@ from lightdepth.command_line.options import Group
 from lightdepth.datasets import FormatName, SequenceSource
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
+from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
 from lightdepth.files.writing import write_together
 from lightdepth.light.fit_on_map import fit_on_map
@@ -60,6 +61,7 @@ def calibrate_light(
         what = f"{data}, frames with known depth"
     else:
         sparse_map, frames = open_with_map(source, map, pairing)
+        sparse_map = by_the_images(sparse_map, frames)
         given = frames[0].camera if camera is not None else None
         check_pairing(sparse_map, frames, pairing, given=given)
         fit = fit_on_map(frames, sparse_map, camera=given, rng=rng)

@@ -58,7 +58,8 @@ def read_stella(path: Path, reader: Reader = Reader(), map_id: int = 0, begun: B
     if not points:
         raise InputError(path, "landmarks: no points in it", "an empty map cannot be densified, leave it out")
     submap = assembled(path, map_id, keyframes, np.array(ids, np.int64), np.array(points).reshape(-1, 3))
-    return replace(submap, localised=_localised(path, cameras.clock(entries), begun))
+    clock = cameras.clock(entries)
+    return replace(submap, localised=_localised(path, clock, begun), guessed_clock=_guesses(entries, clock))
 
 
 def _localised(path: Path, clock: Clock, begun: Begun) -> tuple[int, ...] | None:
@@ -166,6 +167,13 @@ def _names(entries: Mapping[str, Mapping[Any, Any]], cameras: _Cameras, path: Pa
         return [f"{_integer(e['src_frm_id'], f'{where}.src_frm_id'):06d}.png" for where, e in entries.items()]
     times = np.array([_time(entry, where) for where, entry in entries.items()])
     return cameras.clock(entries).names(times, path, begun)
+
+
+def _guesses(entries: Mapping[str, Mapping[Any, Any]], clock: Clock) -> bool:
+    """Whether the keyframes' times are of a clock whose beginning had to be guessed."""
+    if all("src_frm_id" in entry for entry in entries.values()):
+        return False
+    return clock.guesses(np.array([_time(entry, where) for where, entry in entries.items()]))
 
 
 def _time(entry: Mapping[Any, Any], where: str) -> float:

@@ -68,7 +68,8 @@ def read_tum_map(folder: Path, reader: Reader) -> Submap:
     names = convention.clock.names(times, trajectory, begun(folder))
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     keyframes = [convention.keyframe(name, camera, pose, *none) for name, pose in zip(names, poses, strict=True)]
-    return assembled(folder, 0, keyframes, *_read_cloud(cloud), check=guessed)
+    submap = assembled(folder, 0, keyframes, *_read_cloud(cloud), check=guessed)
+    return replace(submap, guessed_clock=convention.clock.guesses(times))
 
 
 def _only(paths: list[Path], folder: Path, what: str, cure: str) -> Path:

@@ -50,7 +50,7 @@ class SfmConfig:
     more loops and take longer."""
     mapper: Literal["incremental", "global", "both"] = "both"
     """What places the matched frames: incremental, one after the other; global, all at once (GLOMAP); both, global
-    for those that incremental left, as submaps of their own."""
+    for those that incremental left, as submaps of their own where many points hold them."""
     min_model_size: int = 3
     """Least number of frames in a submap. More leave out small submaps."""
     min_points: int = 8

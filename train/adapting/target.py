@@ -13,6 +13,7 @@ from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
+from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
 from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
@@ -74,6 +75,7 @@ def read_target(
     training, held = parted(frames, config.held_out)
     check_exposed((training, held))
     if sparse_map is not None:
+        sparse_map = by_the_images(sparse_map, frames)
         check_shared_frames(sparse_map, frames)
         check_pairing(sparse_map, frames, pairing, run, frames[0].camera if source.camera is not None else None)
         write_camera(frames[0].camera, run.folder / "camera.json")
