@@ -8,12 +8,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import msgpack
 import numpy as np
 import pytest
 import trimesh
 from test_cli import SMALL, lightdepth
 from test_sfm import PINHOLE, aligned, film, pose
+from videos import uneven_times, write_video
 
 from lightdepth.datasets import write_folder
 from lightdepth.files.tum import write_tum
@@ -112,6 +114,16 @@ def test_where_nothing_tells_when_a_clock_began_the_images_do(data, submap, tmp_
     assert [int(row.split(",")[1]) for row in rows] == list(range(2, COUNT))
 
 
+@pytest.mark.parametrize("name", ["good", "unix_clock", "drifting"])
+def test_maps_of_the_real_program_meet_the_frames_that_they_were_made_of(realdata, name, tmp_path):
+    for part in ("frames", "camera.json", "mask.png"):
+        (tmp_path / part).symlink_to(realdata / "stella" / part)
+    (tmp_path / "out").symlink_to(realdata / "stella" / name)
+    expected = json.loads((realdata / "stella" / "maps.json").read_text())[name]["keyframe_frames"]
+    found = met(tmp_path, tmp_path / "out")
+    assert sorted(int(n) for n, row in found.items() if row[1] == "1") == sorted(expected)
+
+
 @pytest.mark.parametrize("places", [("a.msg", "b.msg"), ("0/map.msg", "1/map.msg")])
 def test_several_of_its_maps_are_submaps_on_one_clock(data, submap, tmp_path, places):
     parts = [Submap(i, submap.keyframes[4 * i : 4 * i + 4], submap.point_ids, submap.points) for i in (0, 1)]
@@ -165,6 +177,21 @@ def test_a_trajectory_in_unix_seconds_meets_frames_that_count_from_0(data, subma
         assert "--map-fps" in capsys.readouterr().err
         options = ["--map-fps", 25]
     found = met(frames, out, *options)
+    assert {n: r[1] for n, r in found.items()} == {n: r[1] for n, r in plain.items()}
+
+
+def test_a_video_of_uneven_rate_meets_a_trajectory_by_its_own_times(data, submap, plain, tmp_path):
+    times = uneven_times(COUNT)
+    images = [cv2.imread(str(image))[..., ::-1] for image in sorted((data / "frames").iterdir())]
+    (tmp_path / "film").mkdir()
+    video = write_video(tmp_path / "film" / "film.mkv", images, times)
+    shutil.copy(data / "camera.json", tmp_path / "film")
+    out = tmp_path / "orb"
+    out.mkdir()
+    trajectory(submap, out / "KeyFrameTrajectory.txt", lambda n: UNIX + times[n])
+    write_text_model(submap, tmp_path / "model")
+    shutil.copy(tmp_path / "model" / "points3D.txt", out)
+    found = met(video, out)
     assert {n: r[1] for n, r in found.items()} == {n: r[1] for n, r in plain.items()}
 
 
@@ -275,6 +302,21 @@ def test_a_far_map_gives_the_same_mesh_and_keeps_what_was_taken_off(data, submap
     apart = near.kdtree.query(np.asarray(there.vertices) - (far - added))[0]
     # The grid of voxels begins elsewhere, so vertices are not the same; the surface is.
     assert np.median(apart) < record["voxel"] and np.abs(near.area / there.area - 1) < 0.005
+
+
+def test_a_far_map_that_is_repaired_stays_where_it_lies(tmp_path):
+    frames = film(PINHOLE, 6)
+    write_folder([replace(f, name=f"{f.number:06d}") for f in frames], tmp_path / "film")
+    assert lightdepth("sparse", tmp_path / "film", "-o", tmp_path / "mapped") == 0
+    (found,) = read_map(tmp_path / "mapped" / "sparse").submaps
+    far = np.array([4.6e5, 5.4e6, 160.0])
+    write_text_model(Submap(0, *_shifted(found, far)), tmp_path / "far")
+    argv = ["--repair", tmp_path / "far", "-o", tmp_path / "repaired"]
+    assert lightdepth("sparse", tmp_path / "film", *argv) == 0
+    (again,) = read_map(tmp_path / "repaired" / "sparse").submaps
+    assert np.allclose(again.origin, far, atol=100)
+    centers = [np.stack([k.center for k in s.keyframes]) + s.origin for s in (found, again)]
+    assert np.allclose(centers[0] + far, centers[1], atol=0.5)
 
 
 def _shifted(submap: Submap, by: np.ndarray) -> tuple:

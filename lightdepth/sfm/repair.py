@@ -121,7 +121,9 @@ def repaired_submap(
         _bring_to(model, given)
         model.write_text(work / "model")
         (work / "model").rename(out_folder)
-        new = read_submap(out_folder, submap.id)
+        new = replace(read_submap(out_folder, submap.id), origin=submap.origin)
+        if any(new.origin):
+            write_text_model(new, out_folder)  # where the old one lies
     if fit:
         new = with_camera(new, written.camera, fit.rotation)
     return new, Repair(
