@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field, fields
 from functools import cached_property
@@ -155,7 +156,8 @@ class DenseMap(Brief):
 
     def write(self, folder: str | Path, formats: tuple[str, ...] = ("ply",), mm_per_unit: float | None = None) -> None:
         """mesh.*, cloud.ply, sparse.ply, keyframes.csv, trajectory.tum, camera.json; trajectory times are frame
-        numbers. With mm_per_unit, lengths are written in mm. `folder` is made; raises InputError where it is there."""
+        numbers. With mm_per_unit, lengths are written in mm. Of a map that lies far from its origin, origin.json has
+        what all coordinates lack. `folder` is made; raises InputError where it is there."""
         import trimesh
 
         folder = Path(folder)
@@ -185,6 +187,8 @@ class DenseMap(Brief):
             pose[:3, 3] *= scale
             poses.append(pose)
         write_camera(self.submap.keyframes[0].camera, folder / "camera.json")
+        if any(self.submap.origin):
+            write_origin(folder, self.submap, scale)
         write_tum(folder / "trajectory.tum", [float(k.number) for k in self.submap.keyframes], poses)
 
     def _write_keyframes(self, path: Path, scale: float) -> None:
@@ -198,6 +202,13 @@ class DenseMap(Brief):
                 found = self.contributions.get(a.keyframe)
                 row += [f"{value:.4f}" for value in astuple(found)] if found else [""] * len(fields(Contribution))
                 table.writerow([*row, a.reason])
+
+
+def write_origin(folder: Path, submap: Submap, scale: float) -> None:
+    """origin.json: what is to be added to the coordinates of the other files for those of the map that was read, in
+    their unit. Single precision, which meshes are written in, could not hold both."""
+    added = [float(value * scale) for value in submap.origin]
+    (folder / "origin.json").write_text(json.dumps({"add_to_all_coordinates": added}) + "\n")
 
 
 def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.ndarray | None = None) -> None:

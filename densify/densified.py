@@ -129,6 +129,7 @@ class Densified:
                     "aligned": len(dense.aligned),
                     "vertices": len(dense.vertices),
                     "voxel": dense.voxel,
+                    "origin": [value * (mm_per_unit or 1.0) for value in dense.submap.origin],
                     "seen_share": result.seen_share,
                     "coverage": result.coverage and result.coverage.scaled(mm_per_unit or 1.0).record(),
                     "verdict": judgement and plain(judgement.verdict),

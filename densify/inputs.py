@@ -11,12 +11,14 @@ from densify.placing import Placing
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
+from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
+from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, check_image_size
 from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
-from lightdepth.maps import read_map
+from lightdepth.maps.convention import MapReading
 from lightdepth.models import ConstantModel, DepthModel
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
@@ -36,6 +38,21 @@ class MapSource(PairingConfig):
     """Make the map anew before it is used, by matching the images of its keyframes, beginning at its poses and keeping
     its frame and scale; written to sparse/ in the run folder. Switched off, it is used as it is."""
 
+    @classmethod
+    def read_as(cls, map: Path, reading: MapReading, trust_map: bool = False, repair_map: bool = False) -> MapSource:
+        """A map that is read as was said elsewhere."""
+        return cls(
+            trust_map,
+            map,
+            repair_map,
+            map_folder=reading.map_folder,
+            map_sensor=reading.map_sensor,
+            frame_offset=reading.frame_offset,
+            map_fps=reading.map_fps,
+            time_offset=reading.time_offset,
+            time_tolerance=reading.time_tolerance,
+        )
+
 
 def map_and_frames(
     run: Run, source: SequenceSource, mapped: MapSource, sfm: SfmConfig
@@ -46,10 +63,11 @@ def map_and_frames(
     if mapped.map is None:
         frames = source.open()
         return made_sparse(run, frames, sfm), frames
-    sparse_map = read_map(mapped.map)
+    sparse_map, frames = open_with_map(source, mapped.map, mapped)
+    sparse_map = by_the_images(sparse_map, frames)
     map_camera = sparse_map.submaps[0].keyframes[0].camera
-    frames = source.open(map_camera)
     check_shared_frames(sparse_map, frames)
+    _say_localised(run, sparse_map, frames)
     width, height = frames.image_size()
     given = frames[0].camera if source.camera is not None else None
     if (map_camera.width, map_camera.height) != (width, height):
@@ -57,6 +75,25 @@ def map_and_frames(
     fitted = fitted_to_frames(sparse_map, width, height, given)  # first: a cropped image is refused by its size
     check_pairing(sparse_map, frames, mapped, run, given)
     return (repaired(run, fitted, frames, sfm) if mapped.repair_map else fitted), frames
+
+
+def _say_localised(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> None:
+    """How much of the sequence the map's SLAM knew its place in, where the map tells; and where a far map begins."""
+    there = set(frames.numbers)
+    told = {}
+    for submap in sparse_map.submaps:
+        if any(submap.origin):
+            at = ", ".join(f"{value:.0f}" for value in submap.origin)
+            run.log(f"map {submap.id} lies far from its origin: {at} is taken off its coordinates, see origin.json")
+        if submap.localised is not None:
+            count = len(there.intersection(submap.localised))
+            told[submap.id] = {"localised": count, "frames": len(there), "keyframes": len(submap.keyframes)}
+            run.log(
+                f"map {submap.id}: {count} of {len(there)} frames localised ({count / len(there):.0%}), "
+                f"{len(submap.keyframes)} of them keyframes"
+            )
+    if told:
+        run.record["localised"] = plain(told)
 
 
 def repaired(run: Run, sparse_map: SparseMap, frames: FrameSequence, config: SfmConfig) -> SparseMap:

@@ -30,7 +30,9 @@ from densify.inputs import MapSource, check_unit, map_and_frames
 from densify.judging.withheld import WithheldOfMap, withheld_errors
 from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
+from lightdepth.datasets.reading import stamps_of
 from lightdepth.errors import InputError
+from lightdepth.maps.convention import MapReading, Reader
 from lightdepth.models import DepthModel
 from lightdepth.reporting.run import Run
 from lightdepth.sfm.config import SfmConfig
@@ -62,7 +64,7 @@ class TruthSource:
 
 
 @dataclass(frozen=True)
-class JudgingConfig:
+class JudgingConfig(MapReading):
     """How errors are taken."""
 
     mm_per_unit: float | None = None
@@ -193,17 +195,20 @@ def _maps(
     """The frames of a sequence, its maps, and what is said of their withheld points where it was not said before."""
     judged, folder = asked.pairs[name]
     if model is None or map_folders(judged) or judged.is_file():
-        frames, maps = asked.source.sequence(folder).open(), read_models(judged, asked.trajectory)
+        frames = asked.source.sequence(folder).open()
+        reader = Reader(asked.config, stamps_of(folder, asked.source.format), frames[0].camera)
+        maps = read_models(judged, asked.trajectory, reader)
         check_truth(frames, asked.config.trust_truth)
         return frames, maps, withheld_errors(judged) if asked.suite else []
-    mapped = MapSource(asked.config.trust_map, judged)
+    mapped = MapSource.read_as(judged, asked.config, asked.config.trust_map)
     sparse_map, frames = map_and_frames(out, asked.source.sequence(folder), mapped, SfmConfig())
     if asked.suite:
         out.record.setdefault("pairings", {})[name] = out.record.pop("pairing")
     check_truth(frames, asked.config.trust_truth)
     maps, points = _made_dense(frames, sparse_map, model, out.folder / name if asked.suite else out.folder)
+    reader = Reader(asked.config, stamps_of(folder, asked.source.format))
     poses = asked.trajectory or (judged if trajectory_files(judged) else None)
-    return frames, with_trajectories(maps, read_trajectories(poses)) if poses else maps, points
+    return frames, with_trajectories(maps, read_trajectories(poses, reader)) if poses else maps, points
 
 
 def _judged_maps(

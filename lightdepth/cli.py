@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 from lightdepth import __version__
 from lightdepth.command_line.own_packages import own_packages_first
+from lightdepth.command_line.pipes import outliving_readers
 from lightdepth.errors import InputError, PartialFailure
 
 GROUP = "lightdepth.commands"
@@ -48,7 +49,11 @@ ORDER = (
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed."""
-    argv = sys.argv[1:] if argv is None else argv
+    with outliving_readers():
+        return _main(sys.argv[1:] if argv is None else argv)
+
+
+def _main(argv: list[str]) -> int:
     try:
         own_packages_first()
     except InputError as error:

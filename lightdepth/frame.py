@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
@@ -16,21 +15,7 @@ from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.photometry import LightTerms, PhotometricCalibration
-
-
-def frame_number(name: str) -> int:
-    """The integer by which a frame and a map's keyframe meet: the last run of digits in the file's stem.
-
-    C3VD's `0012_color` and `12_color` are both 12. Raises InputError when there is none.
-    """
-    stem = name.replace("\\", "/").rsplit("/", 1)[-1]
-    stem = re.sub(r"\.[A-Za-z]\w*$", "", stem)
-    digits = re.findall(r"\d+", stem)
-    if not digits:
-        raise InputError(
-            name or "''", "no number in the name", "frames are matched with map entries by the integer in it"
-        )
-    return int(digits[-1])
+from lightdepth.which_frame import frame_number as frame_number
 
 
 @dataclass(frozen=True, repr=False)

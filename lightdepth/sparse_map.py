@@ -8,7 +8,7 @@ centre at (0.5, 0.5) whatever the file said.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,8 @@ from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.frame import frame_number
+
+_FAR = 100  # times the reach of a map that its middle lies away from the origin, from which it is far
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,6 +66,13 @@ class Submap(Brief):
     points: np.ndarray
     weak_visibility: bool = False
     """True when observations were guessed by projection instead of read."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where our coordinates begin in those of the map's files: other than 0 for a map that lies far from its own
+    origin, where single precision would have no digits left for its shape."""
+    localised: tuple[int, ...] | None = None
+    """Numbers of the frames whose place the map's SLAM knew, keyframes or not; None where nothing tells."""
+    guessed_clock: bool = False
+    """True when keyframes are counted from a clock's first stamp, which was taken for the first frame."""
 
     def __post_init__(self) -> None:
         if not len(self.points):
@@ -133,6 +142,34 @@ class SparseMap(Brief):
         twice = sorted(i for i, times in Counter(s.id for s in self.submaps).items() if times > 1)
         if twice:
             raise InputError(self.source, f"two maps have the id {twice[0]}", "every submap needs its own")
+
+
+def near_origin(submap: Submap) -> Submap:
+    """The submap with its middle taken off where it lies far from the origin, and kept as `origin`."""
+    places = np.concatenate([submap.points, [k.center for k in submap.keyframes]])
+    middle = np.rint(np.median(places, axis=0))  # of whole units: what is added again is exact
+    reach = float(np.median(np.linalg.norm(places - middle, axis=1)))
+    if not np.linalg.norm(middle) > _FAR * reach:
+        return submap
+    return _moved(submap, middle)
+
+
+def at_its_place(submap: Submap) -> Submap:
+    """The submap in the coordinates of the files that it came from."""
+    return _moved(submap, -np.array(submap.origin)) if any(submap.origin) else submap
+
+
+def _moved(submap: Submap, by: np.ndarray) -> Submap:
+    """The submap with `by` (3,) taken off its coordinates."""
+
+    def moved(keyframe: Keyframe) -> Keyframe:
+        pose = keyframe.cam_from_map.copy()
+        pose[:3, 3] += pose[:3, :3] @ by
+        return replace(keyframe, cam_from_map=pose)
+
+    x, y, z = (np.array(submap.origin) + by).tolist()
+    keyframes = tuple(map(moved, submap.keyframes))
+    return replace(submap, keyframes=keyframes, points=submap.points - by, origin=(x, y, z))
 
 
 def covisibility(submap: Submap) -> np.ndarray:

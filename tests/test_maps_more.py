@@ -180,11 +180,19 @@ def test_a_stella_map_comes_back_within_1e_9_on_its_lenses(tmp_path, camera, suf
     assert not submap.weak_visibility
 
 
-def test_a_folder_with_one_stella_map_is_that_map_and_with_two_is_refused(tmp_path):
+def test_several_stella_maps_in_one_folder_or_in_numbered_ones_are_submaps(tmp_path):
     write_stella(scene(), tmp_path / "a.msg")
     assert_equal_maps(read_map(tmp_path).submaps[0], scene(), atol=1e-9)
     write_stella(scene(), tmp_path / "b.msg")
-    refusal(tmp_path, "several stella_vslam maps (a.msg, b.msg)")
+    assert [s.id for s in read_map(tmp_path).submaps] == [0, 1]
+    write_stella(scene(), tmp_path / "session" / "4" / "map.msg")
+    write_stella(scene(), tmp_path / "session" / "7" / "map.msg")
+    assert [s.id for s in read_map(tmp_path / "session").submaps] == [4, 7]
+    write_stella(scene(), tmp_path / "session" / "7" / "again.msg")
+    refusal(tmp_path / "session", "several maps (again.msg, map.msg)")
+    for name in ("map_2.msg", "map_10.msg"):
+        write_stella(scene(), tmp_path / "numbered" / name)
+    assert [s.id for s in read_map(tmp_path / "numbered").submaps] == [2, 10]
 
 
 def stella(path: Path, change) -> Path:
@@ -234,7 +242,7 @@ def test_keyframes_without_a_frame_number_are_counted_by_time_where_the_rate_is_
             entry["ts"] = entry.pop("src_frm_id") / 40
 
     path = stella(tmp_path / "m.msg", by_time)
-    refusal(path, "keyframes.0.src_frm_id: missing; put fps into densify_map.json")
+    refusal(path, "is not a frame number; give --map-fps", "densify_map.json")
     (tmp_path / "densify_map.json").write_text(json.dumps({"fps": 40}))
     assert_equal_maps(read_map(path).submaps[0], scene(FISHEYE), atol=1e-9)
 

@@ -7,9 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from densify.inputs import MapSource, map_and_frames
+from lightdepth.command_line.options import Group
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
+from lightdepth.datasets.reading import stamps_of
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
+from lightdepth.frame import frame_number
+from lightdepth.maps.convention import MapConvention, MapReading
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.made import made_sparse
@@ -24,6 +28,7 @@ def sparse(
     poses: str | None = None,
     repair: Path | None = None,
     sfm: SfmConfig = SfmConfig(),
+    reading: Group[MapReading] = MapReading(),
     overwrite: bool = False,
 ) -> None:
     """A sparse map by pycolmap, where there is no SLAM output or a poor one.
@@ -36,7 +41,8 @@ def sparse(
         camera: Calibration file that wins over the folder's own.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         poses: Known poses of the frames: truth (those of the sequence), or a TUM file (world from camera) whose times
-            are frame numbers; only points are then found. Left out, poses are found as well.
+            are frame numbers, or seconds where the frames are stamped or --map-fps counts; only points are then found.
+            Left out, poses are found as well.
         repair: Sparse map of the frames to make anew, by matching the images of its keyframes, beginning at its poses
             and keeping its frame and scale; not with --poses. Left out, the map is made of all frames.
         sfm: how frames are mapped
@@ -46,18 +52,26 @@ def sparse(
         raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
     source = SequenceSource(data, format, camera, mask=mask)
     arguments = recorded(
-        output=output, data=data, format=format, camera=camera, mask=mask, poses=poses, repair=repair, sfm=sfm
+        reading,
+        output=output,
+        data=data,
+        format=format,
+        camera=camera,
+        mask=mask,
+        poses=poses,
+        repair=repair,
+        sfm=sfm,
     )
     with run_folder(output, "sparse", arguments, overwrite) as run:
         run.hash_inputs(data=data, repair=repair)
         if repair is not None:
-            map_and_frames(run, source, MapSource(map=repair, repair_map=True), sfm)
+            map_and_frames(run, source, MapSource.read_as(repair, reading, repair_map=True), sfm)
             return
         frames = source.open()
-        made_sparse(run, frames, sfm, None if poses is None else _poses(poses, frames))
+        made_sparse(run, frames, sfm, None if poses is None else _poses(poses, frames, source, reading))
 
 
-def _poses(given: str, frames: FrameSequence) -> dict[int, np.ndarray]:
+def _poses(given: str, frames: FrameSequence, source: SequenceSource, reading: MapReading) -> dict[int, np.ndarray]:
     """Known poses (4, 4) by frame number."""
     if given == "truth":
         found = ((f.number, f.true_world_from_cam) for f in frames)
@@ -66,4 +80,6 @@ def _poses(given: str, frames: FrameSequence) -> dict[int, np.ndarray]:
             raise InputError(frames.source, "no frame has a pose", "give --poses FILE, a TUM trajectory")
         return known
     times, poses = read_tum(Path(given))
-    return dict(zip(times.round().astype(int).tolist(), poses, strict=True))
+    clock = reading.over(MapConvention(frames=stamps_of(source.data, source.format))).clock
+    numbers = [frame_number(name) + reading.frame_offset for name in clock.names(times, given, begun=None)]
+    return dict(zip(numbers, poses, strict=True))

@@ -18,6 +18,7 @@ from densify.evaluation.trajectory import (
 )
 from lightdepth.errors import InputError
 from lightdepth.maps import read_map
+from lightdepth.maps.convention import Reader
 from lightdepth.sparse_map import SparseMap
 
 
@@ -68,19 +69,19 @@ def with_trajectories(models: Sequence[JudgedMap], trajectories: Sequence[Trajec
     return [JudgedMap(by_id[m.trajectory.id], m.clouds, m.triangles) for m in models]
 
 
-def read_models(path: Path, trajectory: Path | None = None) -> list[JudgedMap]:
+def read_models(path: Path, trajectory: Path | None = None, reader: Reader = Reader()) -> list[JudgedMap]:
     """Whatever has poses at a path: a densify run, a map, or trajectories. `trajectory` replaces the keyframes' poses;
     a multi-map tree brings its own. Raises InputError saying what was found and what would be right."""
     if map_folders(path):
         models = dense_models(read_run(path))
     elif path.is_file() and trajectory_files(path):
-        return [JudgedMap(t) for t in read_trajectories(path)]
+        return [JudgedMap(t) for t in read_trajectories(path, reader)]
     else:
         try:
-            models = sparse_models(read_map(path))
+            models = sparse_models(read_map(path, reader))
         except InputError as error:
             if path.is_dir() and trajectory_files(path):
-                return [JudgedMap(t) for t in read_trajectories(path)]
+                return [JudgedMap(t) for t in read_trajectories(path, reader)]
             raise InputError(
                 path,
                 "neither map_* folders (a densify run) nor .npz files (predictions) nor a trajectory, and no map: "
@@ -88,7 +89,7 @@ def read_models(path: Path, trajectory: Path | None = None) -> list[JudgedMap]:
                 error.cure,
             ) from error
         trajectory = trajectory or (path if trajectory_files(path) else None)
-    return models if trajectory is None else with_trajectories(models, read_trajectories(trajectory))
+    return models if trajectory is None else with_trajectories(models, read_trajectories(trajectory, reader))
 
 
 def is_made_by_us(path: Path) -> bool:

@@ -7,7 +7,7 @@ scale of the map, which is only possible where it is known in millimetres. ATE i
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +19,10 @@ from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
 from lightdepth.frame import frame_number
 from lightdepth.maps import read_trajectory
-from lightdepth.maps.convention import EXPORTER, declared_convention, frame_names
+from lightdepth.maps.convention import EXPORTER, Reader
 from lightdepth.maps.endocartoscope import MAPS, TRAJECTORIES, TRAJECTORY_FILE
-from lightdepth.maps.tum import is_trajectory
+from lightdepth.maps.stella import declared_rate
+from lightdepth.maps.tum import begun, is_trajectory
 from lightdepth.sparse_map import Submap
 
 CLIMB_POSES = 100
@@ -83,18 +84,19 @@ def trajectory_files(path: Path) -> list[Path]:
     return []
 
 
-def read_trajectories(path: Path) -> list[Trajectory]:
+def read_trajectories(path: Path, reader: Reader = Reader()) -> list[Trajectory]:
     """What `trajectory_files` finds, as trajectories by map id. A TUM file is one map; its times are frame numbers, or
-    seconds where a densify_map.json beside it has the fps. Raises InputError when there is none."""
+    seconds where the frames' own stamps, a densify_map.json or a stella_vslam map beside it, or the user, tell how to
+    count them. Raises InputError when there is none."""
     files = trajectory_files(path)
     if not files:
         raise InputError(
             path, "no trajectory", "expected a TUM file (t tx ty tz qx qy qz qw) or CLiMB's cam_traj_map_*.txt"
         )
-    return [_read(file) for file in files]
+    return [_read(file, reader) for file in files]
 
 
-def _read(file: Path) -> Trajectory:
+def _read(file: Path, reader: Reader) -> Trajectory:
     match = TRAJECTORY_FILE.fullmatch(file.name)
     map_id = int(match[1]) if match else 0
     tree: Path = file.parent
@@ -103,7 +105,7 @@ def _read(file: Path) -> Trajectory:
         maps = file.parent.parent / MAPS
         tree = next((p for p in maps.glob("*") if p.name.isdecimal() and int(p.name) == map_id), file.parent)
         roots = (maps, maps.parent)
-    convention = declared_convention(tree, map_id, EXPORTER, roots)
+    convention = reader.convention(tree, map_id, EXPORTER, roots)
     if match:
         poses = read_trajectory(file)
         numbers = [frame_number(p.name) + convention.frame_offset for p in poses]
@@ -112,7 +114,11 @@ def _read(file: Path) -> Trajectory:
         whole = not all(keyframe)
     else:
         times, map_from_cam = read_tum(file)
-        numbers = [frame_number(n) + convention.frame_offset for n in frame_names(times, convention.fps, file)]
+        clock, maps_beside = convention.clock, list(file.parent.glob("*.msg"))
+        if clock.fps is None and len(maps_beside) == 1:
+            clock = replace(clock, fps=declared_rate(maps_beside[0]))
+        names = clock.names(times, file, begun(file.parent))
+        numbers = [frame_number(name) + convention.frame_offset for name in names]
         centers = list(map_from_cam[:, :3, 3])
         keyframe, whole = [True] * len(numbers), "keyframe" not in file.name.lower()
     if not numbers:

@@ -40,7 +40,8 @@ def joined_submap(
             keyframes[keyframe.number] = _together(known.get(keyframe.number), keyframe)
     kept = np.unique(np.concatenate([k.point_ids for k in keyframes.values()]))
     ordered = tuple(keyframes[number] for number in sorted(keyframes))
-    return Submap(joined_id, ordered, kept, points[kept], any(s.weak_visibility for s in submaps))
+    weak = any(s.weak_visibility for s in submaps)
+    return Submap(joined_id, ordered, kept, points[kept], weak, submaps[0].origin)
 
 
 def _take_over(

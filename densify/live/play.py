@@ -82,7 +82,8 @@ def play(
             if on_keyframe is not None:
                 on_keyframe(played[-1])
         if densifier.alignments:
-            on_map(densifier.dense_map())
+            dense = densifier.dense_map()
+            on_map(replace(dense, submap=replace(dense.submap, origin=submap.origin)))
     return played
 
 

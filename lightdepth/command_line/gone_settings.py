@@ -34,8 +34,10 @@ def _kept(file: str, gone: Mapping[str, str]) -> str:
     """The file's name, or, where it has settings that are gone, its text without them."""
     import yaml
 
+    from lightdepth.command_line.settings_yaml import read_settings
+
     try:
-        settings = yaml.safe_load(Path(file).read_text())
+        settings = read_settings(Path(file))
     except (OSError, ValueError, yaml.YAMLError):
         return file  # the parser says what is wrong with it
     found = {key: why for key, why in gone.items() if _dropped(settings, key.split("."))}

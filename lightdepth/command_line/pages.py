@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_ALWAYS_RARE = ("print_config", "print_shtab")
+_ALWAYS_RARE = ("print_config", "print_shtab", "map_sensor", "time_tolerance", "map_folder", "frame_offset")
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_pa
 
 from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, literals, placeholder
 from lightdepth.command_line.pages import Page
+from lightdepth.command_line.settings_yaml import read_settings, use_words
 
 HELP, HELP_ALL = ("-h", "--help"), ("--help-all", "--help_all")
 _WIDTH = 100
@@ -66,6 +67,7 @@ class Parser(ArgumentParser):
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         set_parsing_settings(docstring_parse_attribute_docstrings=True)
+        use_words()
         super().__init__(*arguments, **{"formatter_class": Formatter, **settings})
         self.page = Page()
 
@@ -326,7 +328,7 @@ def _check_config(parser: Parser, file: Path) -> None:
     more = f"Read on: {parser.prog} --help"
     if not _is_yaml(file):
         fail(parser, f"{file}: not YAML: expected a line `option: value` for each setting. {more}")
-    found = yaml.safe_load(file.read_text())
+    found = read_settings(file)
     if not isinstance(found, Mapping):
         fail(parser, f"{file}: no settings in it; expected a line `option: value` for each. {more}")
     below = {action.dest.partition(".")[0]: action.dest for action in options(parser) if "." in action.dest}
@@ -337,7 +339,7 @@ def _check_config(parser: Parser, file: Path) -> None:
 
 def _is_yaml(path: Path) -> bool:
     try:
-        yaml.safe_load(path.read_text())
+        read_settings(path)
     except (yaml.YAMLError, UnicodeDecodeError):
         return False
     return True
@@ -347,7 +349,7 @@ def _file_with(argv: Sequence[str], key: str) -> str:
     """`FILE: ` for the last file of settings on the command line that has the key, else nothing."""
     result = ""
     for path in _config_files(argv):
-        node: Any = yaml.safe_load(path.read_text()) if _is_yaml(path) else None
+        node: Any = read_settings(path) if _is_yaml(path) else None
         for part in key.split("."):
             node = node.get(part, _ABSENT) if isinstance(node, Mapping) else _ABSENT
         result = f"{path}: " if node is not _ABSENT else result

@@ -9,13 +9,14 @@ import numpy as np
 from lightdepth.calibration import write_light
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import FormatName, SequenceSource
+from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
+from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
 from lightdepth.files.writing import write_together
 from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.light.report import light_page
-from lightdepth.maps import read_map
 
 
 def calibrate_light(
@@ -60,8 +61,8 @@ def calibrate_light(
         fit = fit_on_truth(source.open(), rng)
         what = f"{data}, frames with known depth"
     else:
-        sparse_map = read_map(map)
-        frames = source.open(sparse_map.submaps[0].keyframes[0].camera)
+        sparse_map, frames = open_with_map(source, map, pairing)
+        sparse_map = by_the_images(sparse_map, frames)
         given = frames[0].camera if camera is not None else None
         check_pairing(sparse_map, frames, pairing, given=given)
         fit = fit_on_map(frames, sparse_map, camera=given, rng=rng)

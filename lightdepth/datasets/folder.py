@@ -1,6 +1,7 @@
 """A folder of frames: images (in `frames/` or directly), camera.json, light.json, mask.png; truth/ where there is any.
 
-times.csv has a line `NAME,seconds` for each frame whose time is known, after a line of headings; it wins over truth's.
+times.csv has a line `NAME,seconds` for each frame whose time is known, after a line of headings; it wins over a time
+that is a frame's name (`frame_00.03s.png`), and this over truth's.
 
 truth/distance/NAME.tiff is float32 [mm] along the ray, 0 where unknown; truth/poses.tum holds world_from_cam, one line
 `time tx ty tz qx qy qz qw` per frame in order, millimetres.
@@ -8,7 +9,7 @@ truth/distance/NAME.tiff is float32 [mm] along the ray, 0 where unknown; truth/p
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -29,6 +30,7 @@ from lightdepth.files.images import image_size, read_raw, to_bgr8
 from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.which_frame import WhichFrame
 
 
 def image_folder(path: Path) -> Path:
@@ -75,6 +77,8 @@ def read_folder(
         )
     clock = read_times(path / "times.csv") if (path / "times.csv").is_file() else {}
     of_truth = [None if times is None else float(times[i]) for i in range(len(images))]
+    named = [WhichFrame.named(image.name).time for image in images]
+    of_name = [known if time is None else time for time, known in zip(named, of_truth, strict=True)]
 
     def distance(i: int) -> np.ndarray | None:
         file = truth / "distance" / f"{images[i].stem}.tiff"
@@ -86,10 +90,23 @@ def read_folder(
         camera,
         light,
         mask,
-        times=[clock.get(image.stem, time) for image, time in zip(images, of_truth, strict=True)],
+        times=[clock.get(image.stem, time) for image, time in zip(images, of_name, strict=True)],
         poses=poses,
         distance=distance,
     )
+
+
+def stamps(path: Path, images: Sequence[Path]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Numbers (n,) of a folder's images and their times (n,) [s]; None where these are not known of all."""
+    known = [WhichFrame.named(image.name) for image in images]
+    clock = read_times(path / "times.csv") if (path / "times.csv").is_file() else {}
+    of_truth = path / "truth" / "poses.tum"
+    true = read_tum(of_truth)[0].tolist() if of_truth.is_file() else []
+    true = true if len(true) == len(images) else [None] * len(images)
+    named = [t if w.time is None else w.time for w, t in zip(known, true, strict=True)]
+    times = [clock.get(image.stem, time) for image, time in zip(images, named, strict=True)]
+    found = None if any(time is None for time in times) else np.array(times, np.float64)
+    return np.array([w.number for w in known], np.int64), found
 
 
 def _has_camera(path: Path) -> bool:

@@ -18,9 +18,9 @@ def check_shared_frames(sparse_map: SparseMap, frames: FrameSequence) -> None:
         return
     first, last = min(frames.numbers), max(frames.numbers)
     if mapped[-1] - mapped[0] > 100 * (last - first + 1):
-        cure = "are the map's times in milliseconds?"
+        cure = "are the map's times in milliseconds? If of another clock, give --time-offset and --map-fps"
     else:
-        cure = f'if one counts from elsewhere, put "frame_offset" into {SIDECAR}'
+        cure = f'if one counts from elsewhere, give --frame-offset, or put "frame_offset" into {SIDECAR}'
     found = f"keyframes {mapped[0]} to {mapped[-1]}, {frames.source}: frames {first} to {last}"
     if not shared:
         raise InputError(

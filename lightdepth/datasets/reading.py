@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import c3vd, endomapper, endoslam, folder, hamlyn, scared, simcol
@@ -17,6 +19,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, read_image
 from lightdepth.frame import check_image_size
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.which_frame import Stamps
 
 _DATA_SETS = (c3vd.FORMAT, simcol.FORMAT, hamlyn.FORMAT, scared.FORMAT, endoslam.FORMAT, endomapper.FORMAT)
 _BY_NAME = {data_set.name: data_set for data_set in (folder.FORMAT, *_DATA_SETS)}
@@ -56,6 +59,28 @@ def open_sequence(
             f"cannot be read ({error.strerror or error})",
             "expected files that are there and may be read",
         ) from error
+
+
+def stamps_of(path: str | Path, format: str | None = None) -> Stamps:
+    """Which frames are at `path`, and when they were: of a video by its own times; of a folder by times.csv, by names
+    that are times, else by the times that stand with its true poses. Nothing is looked up before it is asked for."""
+    path = Path(path)
+    images: Path = path
+    if path.is_dir() and not _is_cluster(path, format):
+        data_set = _BY_NAME.get(format) if format is not None else _looks_like(path)
+        images = (data_set or folder.FORMAT).images(path)
+
+    def load() -> tuple[np.ndarray, np.ndarray | None]:
+        try:
+            video = video_at(path) if format in (None, "video") else None
+            if video is not None:
+                times = VideoFile(video).times
+                return np.arange(len(times)), np.asarray(times, np.float64)
+            return folder.stamps(path, list_images(images) if images.is_dir() else [])
+        except (InputError, OSError):
+            return np.zeros(0, int), None  # what is wrong is said when the frames are opened
+
+    return Stamps(load, str(images))
 
 
 def _open(

@@ -10,13 +10,14 @@ from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.detective.investigate import investigate
 from lightdepth.detective.verdict import Verdict
 from lightdepth.errors import InputError
+from lightdepth.maps.convention import MapReading
 from lightdepth.reporting.run import Run
 from lightdepth.sparse_map import SparseMap
 
 
 @dataclass(frozen=True)
-class PairingConfig:
-    """What is asked of frames and a map that are brought together."""
+class PairingConfig(MapReading):
+    """How frames and a map meet, and what is asked of them."""
 
     trust_map: bool = False
     """true: where the images say that the map was made of other frames than these, a warning is given and the run goes

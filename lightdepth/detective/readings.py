@@ -44,7 +44,7 @@ _RATES = (
 def shifted(offset: int) -> Reading:
     """Every keyframe is the frame `offset` later."""
     many = f"{abs(offset)} frame{'s' * (abs(offset) > 1)} {'later' if offset > 0 else 'earlier'}"
-    cure = f'add {offset} to "frame_offset" in {SIDECAR} beside the map (0 where there is none), or rename the frames'
+    cure = f'add {offset} to --frame-offset, or to "frame_offset" in {SIDECAR} beside the map (0 where there is none)'
     return Reading(f"every keyframe is {many}", cure, Counting(offset=offset))
 
 
@@ -64,8 +64,8 @@ def other_rates(last: int) -> list[Reading]:
         if round(rate * last) != last:
             name = f"the video has {rate:.4g} times as many frames a second as the map's times were counted with"
             cure = (
-                f'multiply "fps" in {SIDECAR} beside the map by {rate:.4g} ({true:g} for {assumed:g}, say), or give '
-                "the frames that the map was made of"
+                f'multiply --map-fps, or "fps" in {SIDECAR} beside the map, by {rate:.4g} ({true:g} for {assumed:g}, '
+                "say), or give the frames that the map was made of"
             )
             found.setdefault(round(rate * last), Reading(name, cure, Counting(rate)))
     return list(found.values())

@@ -70,6 +70,21 @@ def checked(submap: Submap, where: Path) -> Submap:
     return submap
 
 
+def guessed(submap: Submap, where: Path) -> Submap:
+    """The submap with every point that no nearer one hides counted as observed, and a warning."""
+    try:
+        submap = seen_by_projection(submap, hide=True)
+    except InputError as error:
+        raise error.within(where) from error
+    warnings.warn(
+        f"{where}: a trajectory and a point cloud do not say which keyframe observed which point; taken to be every "
+        "point in its view that no nearer one hides. Alignment will be weaker: export the keypoints with their point "
+        "ids (COLMAP text) if you can",
+        stacklevel=2,
+    )
+    return submap
+
+
 def _whisper_half_a_pixel(submap: Submap, where: Path, median: float) -> None:
     """Warns when the keypoints fit clearly better half a pixel away, towards the other convention."""
     for shift in (0.5, -0.5):

@@ -22,7 +22,8 @@ from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pos
 from lightdepth.files.text import is_comment, numbered_lines, parse_integer, parse_numbers, text_lines
 from lightdepth.maps.checks import checked
 from lightdepth.maps.convention import COLMAP, MapConvention
-from lightdepth.sparse_map import Keyframe, Submap
+from lightdepth.maps.sensors import of_one_sensor
+from lightdepth.sparse_map import Keyframe, Submap, at_its_place, near_origin
 
 PARTS = ("cameras", "images", "points3D")
 
@@ -61,7 +62,7 @@ def read_submap(folder: Path, map_id: int, convention: MapConvention = COLMAP) -
     if not images:
         raise InputError(f"{paths['images']}", "no images in it", "an empty map cannot be densified, leave it out")
     keyframes = []
-    for image in images:
+    for image in of_one_sensor(images, convention, folder):
         if image.camera_id not in cameras:
             raise InputError(
                 f"{paths['images']}",
@@ -91,7 +92,7 @@ def assembled(
     if len(twice):
         raise InputError(folder, f"point {twice[0]} is in points3D twice", "every point needs its own id")
     try:
-        submap = Submap(map_id, tuple(sorted(keyframes, key=lambda k: k.number)), ids, points)
+        submap = near_origin(Submap(map_id, tuple(sorted(keyframes, key=lambda k: k.number)), ids, points))
     except InputError as error:
         raise error.within(folder) from error
     return check(submap, folder)
@@ -208,7 +209,7 @@ def write_text_model(submap: Submap, folder: Path, images: Mapping[str, np.ndarr
     `images` by keyframe name, (H, W, 3) RGB in [0, 1], give the points their colour; without them points are grey.
     SCARAMUZZA is written under its own name, which `read_map` reads and COLMAP does not know.
     """
-    folder = Path(folder)
+    folder, submap = Path(folder), at_its_place(submap)
     folder.mkdir(parents=True, exist_ok=True)
     cameras = list(dict.fromkeys(k.camera for k in submap.keyframes))
     camera_lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]

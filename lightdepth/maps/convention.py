@@ -17,8 +17,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
-from lightdepth.frame import frame_number
 from lightdepth.sparse_map import Keyframe
+from lightdepth.which_frame import Clock, Stamps, frame_number
 
 SIDECAR = "densify_map.json"
 
@@ -38,6 +38,21 @@ class MapConvention:
     """Number added to that in a keyframe's name, where names do not count as the frames do."""
     fps: float | None = None
     """Frames per second, where a keyframe has a time and no number."""
+    time_offset: float | None = None
+    """What the map's clock shows at the time 0 of the frames, seconds; None where it has to be found."""
+    time_tolerance: float | None = None
+    """How far a keyframe's time may be from its frame's, seconds; None is half a frame."""
+    folder: str | None = None
+    """The folder of images whose keyframes are wanted, of a map that has several."""
+    sensor: int | None = None
+    """The camera whose keyframes are wanted, of a map that has several."""
+    frames: Stamps | None = None
+    """The frames that the map will meet, where they are known."""
+
+    @property
+    def clock(self) -> Clock:
+        """How the times of keyframes become frame numbers."""
+        return Clock(self.fps, self.time_offset, self.time_tolerance, self.frames)
 
     def from_ours(self, camera: CameraModel) -> CameraModel:
         """A camera in our pixels, brought to the map's: the inverse of what `keyframe` does to it."""
@@ -61,9 +76,6 @@ COLMAP = MapConvention()
 EXPORTER = MapConvention(pixel_center=0.0)  # ORB-SLAM3 and its descendants keep OpenCV's pixel coordinates
 
 
-_MAX_FRAME = 10**8  # a month of video; a time of day in seconds or nanoseconds lies above
-
-
 def _zero_or_half(value: float) -> float:
     if value not in (0.0, 0.5):
         raise ValueError("expected 0.0 (OpenCV) or 0.5 (COLMAP)")
@@ -78,10 +90,67 @@ class _Sidecar(BaseModel):
     keypoints: Literal["distorted", "undistorted"] | None = None
     frame_offset: int | None = None
     fps: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    time_offset: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    time_tolerance: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     # For whoever writes or views a map; reading one does not need them.
     image_root: str | None = None
     image_pattern: str | None = None
     unit: Literal["arbitrary", "mm"] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapReading:
+    """How a map's keyframes are told apart and meet their frames, where its files leave it open."""
+
+    map_folder: str | None = None
+    """Folder of images in the map whose keyframes are taken, where it holds several (left, right; two clips)."""
+    map_sensor: int | None = None
+    """Number of the map's camera whose keyframes are taken, where it holds several, such as a stereo rig's left one.
+    Another one takes the keyframes of another camera."""
+    frame_offset: int = 0
+    """Number of frames added to a keyframe's number, where the map counts from elsewhere: -1 where it counts from 1 and
+    the frames from 0. More make later frames of the keyframes."""
+    map_fps: float | None = None
+    """Number of frames per second by which the map's times are counted; it wins over the map's own. A higher one makes
+    later frames of them."""
+    time_offset: float | None = None
+    """What the map's clock shows at the time 0 of the frames, seconds; left out, it is found where the clock is
+    another one, such as Unix time, and said. A larger one makes earlier frames of the keyframes."""
+    time_tolerance: float | None = None
+    """How far a keyframe's time may be from the stamp of its frame, seconds; left out, half a frame. A larger one
+    accepts poorer stamps."""
+
+    def over(self, convention: MapConvention) -> MapConvention:
+        """The convention, with what was said here."""
+        convention = replace(convention, frame_offset=convention.frame_offset + self.frame_offset)
+        said = {
+            "folder": self.map_folder,
+            "sensor": self.map_sensor,
+            "fps": self.map_fps,
+            "time_offset": self.time_offset,
+            "time_tolerance": self.time_tolerance,
+        }
+        return replace(convention, **{name: value for name, value in said.items() if value is not None})  # type: ignore[arg-type]  # each has its field's type
+
+
+@dataclass(frozen=True)
+class Reader:
+    """What is known besides a map's own files: what was said of it, the frames that it will meet, and their camera."""
+
+    reading: MapReading = MapReading()
+    frames: Stamps | None = None
+    camera: CameraModel | None = None
+
+    def convention(
+        self, folder: Path, map_id: int, habit: MapConvention, roots: tuple[Path, ...] = ()
+    ) -> MapConvention:
+        """The habit of the format, what is declared, then what was said."""
+        declared = declared_convention(folder, map_id, habit, roots)
+        return self.reading.over(replace(declared, frames=self.frames))
+
+
+class CameraMissing(InputError):
+    """A map has no camera of its own: that of the frames may be given in its place."""
 
 
 def declared_convention(folder: Path, map_id: int, habit: MapConvention, roots: tuple[Path, ...] = ()) -> MapConvention:
@@ -92,40 +161,8 @@ def declared_convention(folder: Path, map_id: int, habit: MapConvention, roots: 
     found = checked_fields(_Sidecar, read_json(path), str(path))
     if found.map_id is not None and path.parent == folder and found.map_id != map_id:
         raise InputError(path, f"map_id {found.map_id} in the folder of map {map_id}", "correct one of the two")
-    names = ("pixel_center", "pose_convention", "keypoints", "frame_offset", "fps")
+    names = ("pixel_center", "pose_convention", "keypoints", "frame_offset", "fps", "time_offset", "time_tolerance")
     return replace(habit, **{n: getattr(found, n) for n in names if getattr(found, n) is not None})
-
-
-def frame_names(times: np.ndarray, fps: float | None, where: Path | str) -> list[str]:
-    """Six-digit frame names of times (n,): round(t fps), or without fps the times themselves, which must be integers.
-
-    Raises InputError when times are no frame numbers and nothing says how to count, and when two fall on one frame.
-    """
-    counted = np.asarray(times, np.float64) * (1.0 if fps is None else fps)
-    numbers = np.rint(counted)
-    if fps is None and (numbers != counted).any():
-        raise InputError(
-            where,
-            f"the time {times[numbers != counted][0]:g} is not a frame number",
-            f'put the video\'s {{"fps": ...}} into {SIDECAR} beside it to count frames by time, or write frame numbers '
-            "as times",
-        )
-    if (numbers < 0).any() or (numbers > _MAX_FRAME).any():
-        odd = times[(numbers < 0) | (numbers > _MAX_FRAME)][0]
-        raise InputError(
-            where,
-            f"the time {odd:g} falls on no frame",
-            f"expected seconds since the first frame of the video (with fps in {SIDECAR}) or frame numbers, not the "
-            "time of day and not nanoseconds",
-        )
-    found, counts = np.unique(numbers, return_counts=True)
-    if len(found) < len(numbers):
-        raise InputError(
-            where,
-            f"{counts.max()} keyframes fall on frame {found[counts.argmax()]:.0f}",
-            f"is fps in {SIDECAR} too low?",
-        )
-    return [f"{number:06.0f}.png" for number in numbers]
 
 
 def distorted(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:

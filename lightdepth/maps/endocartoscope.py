@@ -6,26 +6,31 @@
 The maps' files are COLMAP text with the exporter's habits: ids from 0, no tracks, keypoints *and* principal point in
 OpenCV pixels (the first pixel's centre at (0, 0)), image names that are frame numbers, distorted keypoints. images.txt
 is camera-from-map; the trajectory is map-from-camera, comma separated, quaternion w first. Each map has its own frame
-of reference and scale.
+of reference and scale. What is submitted to CLiMB may have points3D.txt alone in a map's folder, and a trajectory of
+nine columns with every localised frame: keyframes are chosen among them.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from lightdepth.calibration import read_camera
+from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.colmap_cameras import read_cameras_text
 from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
 from lightdepth.files.text import is_comment, parse_numbers, text_lines
-from lightdepth.frame import frame_number
+from lightdepth.maps.checks import checked, guessed
 from lightdepth.maps.colmap import assembled, read_points_text, read_submap
-from lightdepth.maps.convention import MapConvention
-from lightdepth.sparse_map import SparseMap, Submap
+from lightdepth.maps.convention import CameraMissing, MapConvention
+from lightdepth.sparse_map import SparseMap, Submap, at_its_place
+from lightdepth.which_frame import frame_number
 
 MAPS = "3D_maps"
 TRAJECTORIES = "camera_trajectory"
@@ -44,6 +49,11 @@ class TrajectoryPose:
     name: str
     cam_from_map: np.ndarray
     is_keyframe: bool
+    frame_state: int | None = None
+    """0 frame, 1 keyframe, 2 keyframe once; None where the file does not say"""
+
+
+_STEP, _TURN = 0.1, 8.0  # of the distance to what is near, and degrees: a view from there is another one
 
 
 def trajectory_path(tree: Path, map_id: int) -> Path:
@@ -69,33 +79,95 @@ def read_trajectory(path: Path) -> list[TrajectoryPose]:
         if not np.isfinite(numbers).all():
             continue
         map_from_cam = pose_from_quaternion(numbers[4:8], numbers[1:4], f"{where}: frame {tokens[1]}")
-        is_keyframe = len(tokens) == 9 or tokens[9] == "1"
-        poses.append(TrajectoryPose(float(numbers[0]), tokens[1], np.linalg.inv(map_from_cam), is_keyframe))
+        state = int(tokens[9]) if len(tokens) > 9 and tokens[9].isdigit() else None
+        is_keyframe = state in (None, 1)
+        poses.append(TrajectoryPose(float(numbers[0]), tokens[1], np.linalg.inv(map_from_cam), is_keyframe, state))
     return poses
 
 
-def read_exported_submap(folder: Path, map_id: int, convention: MapConvention) -> Submap:
-    """One map of the tree. Without images.txt, keyframes come from the trajectory and what they saw from projection."""
+def read_exported_submap(
+    folder: Path, map_id: int, convention: MapConvention, own: CameraModel | None = None
+) -> Submap:
+    """One map of the tree. Without images.txt, keyframes come from the trajectory and what they saw from projection.
+    `own` is the frames' camera, which serves where the tree has none."""
     trajectory = trajectory_path(folder.parent.parent, map_id)
     if any((folder / f"images{suffix}").is_file() for suffix in (".txt", ".bin")) or not trajectory.is_file():
-        return read_submap(folder, map_id, convention)
-    for part in ("cameras.txt", "points3D.txt"):
-        if not (folder / part).is_file():
-            raise InputError(
-                folder, f"{part} missing", "with a trajectory alone a map needs cameras.txt and points3D.txt"
-            )
-    cameras = read_cameras_text(folder / "cameras.txt")
-    if len(cameras) != 1:
-        raise InputError(
-            f"{folder / 'cameras.txt'}", f"{len(cameras)} cameras", "without images.txt there must be exactly one"
+        submap = read_submap(folder, map_id, convention)
+        return replace(submap, localised=_localised(trajectory, convention))
+    if not (folder / "points3D.txt").is_file():
+        raise InputError(folder, "points3D.txt missing", "with a trajectory alone a map needs points3D.txt")
+    camera = _camera(folder, convention, own)
+    ids, points = read_points_text(folder / "points3D.txt")
+    poses = read_trajectory(trajectory)
+    numbers = [frame_number(p.name) for p in poses]
+    if _counts_from_one(numbers, convention):
+        warnings.warn(
+            f"{trajectory}: CLiMB counts frames from 1, the frames here count from 0: keyframe n is taken for frame "
+            f"n - 1. Where that is wrong, rename the frames",
+            stacklevel=2,
         )
-    poses = [p for p in read_trajectory(trajectory) if p.is_keyframe]
-    if not poses:
+        convention = replace(convention, frame_offset=-1)
+    of_all = all(p.frame_state is None for p in poses)
+    chosen = [poses[i] for i in spread(poses, points)] if of_all else [p for p in poses if p.is_keyframe]
+    if not chosen:
         raise InputError(trajectory, "no keyframe in it (column frame_state 1)", "expected at least one")
-    (camera,) = cameras.values()
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
-    keyframes = [convention.keyframe(p.name, camera, p.cam_from_map, *none) for p in poses]
-    return assembled(folder, map_id, keyframes, *read_points_text(folder / "points3D.txt"))
+    keyframes = [convention.keyframe(p.name, camera, p.cam_from_map, *none) for p in chosen]
+    submap = assembled(folder, map_id, keyframes, ids, points, check=guessed if of_all else checked)
+    return replace(submap, localised=tuple(n + convention.frame_offset for n in numbers))
+
+
+def _camera(folder: Path, convention: MapConvention, own: CameraModel | None) -> CameraModel:
+    """The map's one camera: of its folder or of one above it up to the tree's, else the frames'."""
+    for place in (folder, folder.parent, folder.parent.parent):
+        if (place / "cameras.txt").is_file():
+            cameras = read_cameras_text(place / "cameras.txt")
+            if len(cameras) != 1:
+                raise InputError(
+                    f"{place / 'cameras.txt'}",
+                    f"{len(cameras)} cameras",
+                    "without images.txt there must be exactly one",
+                )
+            return next(iter(cameras.values()))
+        if (place / "camera.json").is_file():
+            return convention.from_ours(read_camera(place / "camera.json"))
+    if own is not None:
+        return convention.from_ours(own)
+    raise CameraMissing(folder, "no camera", f"put cameras.txt or camera.json there or beside {MAPS}")
+
+
+def _counts_from_one(numbers: Sequence[int], convention: MapConvention) -> bool:
+    """Whether the trajectory counts as CLiMB does and the frames do not."""
+    frames = convention.frames
+    return bool(frames is not None and 0 in frames.numbers and 0 not in numbers and not convention.frame_offset)
+
+
+def _localised(trajectory: Path, convention: MapConvention) -> tuple[int, ...] | None:
+    """Numbers of the frames in a map's trajectory, where it has one that can be read."""
+    try:
+        poses = read_trajectory(trajectory) if trajectory.is_file() else []
+        return tuple(frame_number(p.name) + convention.frame_offset for p in poses) or None
+    except InputError:
+        return None
+
+
+def spread(poses: Sequence[TrajectoryPose], points: np.ndarray) -> list[int]:
+    """Rows of the poses that stand for all, as a SLAM's keyframes do: each so far from the one before that the
+    view is another one."""
+    chosen: list[int] = []
+    near = 0.0
+    for row, pose in enumerate(poses):
+        if chosen:
+            last = poses[chosen[-1]].cam_from_map
+            step = pose.cam_from_map @ np.linalg.inv(last)
+            turned = np.degrees(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1)))
+            if np.linalg.norm(step[:3, 3]) < _STEP * near and turned < _TURN:
+                continue
+        inside = points @ pose.cam_from_map[:3, :3].T + pose.cam_from_map[:3, 3]
+        distance = np.linalg.norm(inside[inside[:, 2] > 0], axis=1)
+        near = float(np.quantile(distance, 0.25)) if len(distance) else 0.0
+        chosen.append(row)
+    return chosen
 
 
 def write_multimap(
@@ -110,7 +182,7 @@ def write_multimap(
     trajectories: for each map id the cam_from_map (4, 4) of every localised frame by name; left out, only keyframes.
     times [s] by frame name; left out, frame number / fps. Names become six-digit frame numbers, as the exporter's are.
     """
-    for submap in sparse_map.submaps:
+    for submap in map(at_its_place, sparse_map.submaps):
         map_folder = Path(folder) / MAPS / str(submap.id)
         map_folder.mkdir(parents=True, exist_ok=True)
         _write_map(submap, map_folder)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from lightdepth.errors import InputError
 from lightdepth.maps.colmap import holds_model, read_submap
-from lightdepth.maps.convention import COLMAP, EXPORTER, declared_convention
+from lightdepth.maps.convention import COLMAP, EXPORTER, Reader
 from lightdepth.maps.endocartoscope import MAPS, read_exported_submap
-from lightdepth.maps.stella import read_stella
+from lightdepth.maps.stella import first_stamp, read_stella
 from lightdepth.maps.tum import (
     POINTS_NEEDED,
     WITHOUT_POINTS,
+    begun,
     first_entry,
     holds_points,
     holds_trajectory,
@@ -27,17 +30,18 @@ _ACCEPTED = (
 )
 
 
-def read_map(path: Path | str) -> SparseMap:
+def read_map(path: Path | str, reader: Reader = Reader()) -> SparseMap:
     """A sparse map on disk -> its submaps, by map id.
 
     Reads a COLMAP model folder (its id is the folder's number, or 0), a folder or its `sparse/` with numbered COLMAP
     models, and the EndoCartoScope / CLiMB tree `3D_maps/<id>` directly below, under `output/` or one run's folder;
-    a stella_vslam map (.msg or .json, or the folder with the .msg); a folder with a TUM trajectory and a point cloud.
+    a stella_vslam map (.msg or .json, or the folder with the .msg, several of which, also in 0/, 1/, are submaps); a
+    folder with a TUM trajectory and a point cloud. `reader` is what is known besides the files.
     Raises InputError saying what was found, where, and what would be right.
     """
     path = Path(path)
     try:
-        return _read_map(path)
+        return _read_map(path, reader)
     except OSError as error:
         raise InputError(
             error.filename or path,
@@ -46,37 +50,37 @@ def read_map(path: Path | str) -> SparseMap:
         ) from error
 
 
-def _read_map(path: Path) -> SparseMap:
+def _read_map(path: Path, reader: Reader) -> SparseMap:
     if not path.exists():
         raise InputError(path, "no such file or folder", _ACCEPTED)
     if path.is_file() and path.suffix.lower() in (".msg", ".json"):
-        return SparseMap((read_stella(path),), str(path))
+        return SparseMap((read_stella(path, reader, begun=_begun([path])),), str(path))
     if not path.is_dir():
         raise _why_not_file(path)
     tree = _multimap_tree(path)
     if tree is not None:
-        return _read_tree(tree, path)
-    if holds_model(path) and (path.resolve().parent.name == MAPS or not holds_trajectory(path)):
+        return _read_tree(tree, path, reader)
+    messages = _messages(path)
+    if holds_model(path) and (path.resolve().parent.name == MAPS or not (messages or holds_trajectory(path))):
         map_id = int(path.resolve().name) if _is_number(path.resolve().name) else 0
         exported = path.resolve().parent.name == MAPS
-        convention = declared_convention(path, map_id, EXPORTER if exported else COLMAP)
-        read = read_exported_submap if exported else read_submap
-        return SparseMap((read(path.resolve() if exported else path, map_id, convention),), str(path))
+        convention = reader.convention(path, map_id, EXPORTER if exported else COLMAP)
+        if exported:
+            return SparseMap((read_exported_submap(path.resolve(), map_id, convention, reader.camera),), str(path))
+        return SparseMap((read_submap(path, map_id, convention),), str(path))
     for root in (path, path / "sparse"):
         if root != path and holds_model(root):
-            return SparseMap((read_submap(root, 0, declared_convention(root, 0, COLMAP, (path,))),), str(path))
+            return SparseMap((read_submap(root, 0, reader.convention(root, 0, COLMAP, (path,))),), str(path))
         folders = {i: f for i, f in _numbered(root).items() if holds_model(f)}
         if folders:
-            conventions = {i: declared_convention(f, i, COLMAP, (root, path)) for i, f in folders.items()}
+            conventions = {i: reader.convention(f, i, COLMAP, (root, path)) for i, f in folders.items()}
             return SparseMap(tuple(read_submap(f, i, conventions[i]) for i, f in folders.items()), str(path))
-    if holds_trajectory(path):
-        return SparseMap((read_tum_map(path),), str(path))
-    messages = sorted(path.glob("*.msg"))
-    if len(messages) > 1:
-        found = ", ".join(m.name for m in messages)
-        raise InputError(path, f"several stella_vslam maps ({found})", f"give one of them, e.g. {messages[0]}")
     if messages:
-        return SparseMap((read_stella(messages[0]),), str(path))
+        begun = _begun(messages.values())
+        submaps = tuple(read_stella(file, reader, map_id, begun) for map_id, file in messages.items())
+        return SparseMap(submaps, str(path))
+    if holds_trajectory(path):
+        return SparseMap((read_tum_map(path, reader),), str(path))
     raise _why_not_folder(path)
 
 
@@ -95,15 +99,42 @@ def _multimap_tree(path: Path) -> Path | None:
     return trees[0] if trees else None
 
 
-def _read_tree(tree: Path, source: Path) -> SparseMap:
+def _messages(path: Path) -> dict[int, Path]:
+    """The stella_vslam maps of a folder, or of its folders 0/, 1/, by map id: the folder's number, else the last in the
+    file's name where each has another, else their order."""
+    files = sorted(path.glob("*.msg"))
+    if not files:
+        found = {i: sorted(folder.glob("*.msg")) for i, folder in _numbered(path).items()}
+        for i, several in found.items():
+            if len(several) > 1:
+                names = ", ".join(file.name for file in several)
+                raise InputError(path / str(i), f"several maps ({names})", "expected one in each numbered folder")
+        return {i: several[0] for i, several in found.items() if several}
+    if len(files) == 1:
+        return {0: files[0]}
+    digits = [re.findall(r"\d+", file.stem)[-1:] for file in files]
+    numbers = [int(found[0]) for found in digits if found]
+    return dict(sorted(zip(numbers if len(set(numbers)) == len(files) else range(len(files)), files, strict=True)))
+
+
+def _begun(maps: Iterable[Path]) -> tuple[float, str] | None:
+    """The first stamp of the clock of stella_vslam maps: of the trajectories beside them, or of their keyframes."""
+    maps = list(maps)
+    several = maps if len(maps) > 1 else []  # one alone knows its own
+    stamps = [(stamp, file.name) for file in several if (stamp := first_stamp(file)) is not None]
+    stamps += [found for folder in sorted({file.parent for file in maps}) if (found := begun(folder)) is not None]
+    return min(stamps, default=None)
+
+
+def _read_tree(tree: Path, source: Path, reader: Reader) -> SparseMap:
     folders = _numbered(tree)
     if not folders:
         raise InputError(tree, "no map in it", f"expected a folder for each map named by its number, {MAPS}/0")
     roots = (tree, tree.resolve().parent)
     submaps = []
     for map_id, folder in folders.items():
-        convention = declared_convention(folder, map_id, EXPORTER, roots)
-        submaps.append(read_exported_submap(folder, map_id, convention))
+        convention = reader.convention(folder, map_id, EXPORTER, roots)
+        submaps.append(read_exported_submap(folder, map_id, convention, reader.camera))
     return SparseMap(tuple(submaps), str(source))
 
 

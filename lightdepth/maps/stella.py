@@ -1,7 +1,8 @@
 """Maps of stella_vslam and OpenVSLAM: one file, msgpack (.msg) or the same fields as .json.
 
-    cameras    {name: {model_type, cols, rows, fx, fy, cx, cy, k1, ...}}
-    keyframes  {id: {src_frm_id, ts, cam, rot_cw [x y z w], trans_cw, lm_ids, keypts [{pt: [u, v]}], undists [[u, v]]}}
+    cameras    {name: {model_type, cols, rows, fps, fx, fy, cx, cy, k1, ...}}
+    keyframes  {id: {ts [s], src_frm_id (gone in 0.6), cam, rot_cw [x y z w], trans_cw, lm_ids,
+                     keypts [{pt: [u, v]}], undists [[u, v]]}}
     landmarks  {id: {pos_w}}
 
 Poses are camera-from-map, pixels OpenCV's (the first one's centre at (0, 0)), a landmark id of -1 is none. `keypts` are
@@ -11,6 +12,7 @@ where the lens put them, `undists` and the later `undist_keypts` where a pinhole
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,25 +26,30 @@ from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
 from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
 from lightdepth.files.schema import read_json
+from lightdepth.files.tum import read_tum
 from lightdepth.maps.colmap import assembled
-from lightdepth.maps.convention import EXPORTER, MapConvention, declared_convention, frame_names
-from lightdepth.sparse_map import Keyframe, Submap
+from lightdepth.maps.convention import EXPORTER, MapConvention, Reader
+from lightdepth.sparse_map import Keyframe, Submap, at_its_place
+from lightdepth.which_frame import Clock, frame_number
 
+Begun = tuple[float, str] | None
 _LENSES = {  # model_type -> our model, the fields of its distortion
     "Perspective": ("OPENCV", ("k1", "k2", "p1", "p2")),
     "Fisheye": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
 
 
-def read_stella(path: Path) -> Submap:
-    """The map in a .msg or .json file, as map 0. Raises InputError naming file and field."""
+def read_stella(path: Path, reader: Reader = Reader(), map_id: int = 0, begun: Begun = None) -> Submap:
+    """The map in a .msg or .json file. `begun` is the first stamp of its clock that is known elsewhere, and where.
+    Raises InputError naming file and field."""
     path = Path(path)
     content = _content(path)
-    convention = declared_convention(path.parent, 0, EXPORTER)
-    cameras = _Cameras(path, content.get("cameras"), convention)
-    keyframes = []
-    for key, entry in _section(content, "keyframes", path).items():
-        keyframes.append(_keyframe(_record(entry, f"{path}: keyframes.{key}"), f"{path}: keyframes.{key}", cameras))
+    cameras = _Cameras(path, content.get("cameras"), reader.convention(path.parent, map_id, EXPORTER))
+    found = {f"{path}: keyframes.{key}": entry for key, entry in _section(content, "keyframes", path).items()}
+    entries = {where: _record(entry, where) for where, entry in found.items()}
+    names = _names(entries, cameras, path, begun)
+    named = zip(entries.items(), names, strict=True)
+    keyframes = [_keyframe(entry, where, name, cameras) for (where, entry), name in named]
     ids, points = [], []
     for key, entry in _section(content, "landmarks", path).items():
         where = f"{path}: landmarks.{key}"
@@ -50,7 +57,27 @@ def read_stella(path: Path) -> Submap:
         points.append(_numbers(_record(entry, where), "pos_w", 3, where))
     if not points:
         raise InputError(path, "landmarks: no points in it", "an empty map cannot be densified, leave it out")
-    return assembled(path, 0, keyframes, np.array(ids, np.int64), np.array(points).reshape(-1, 3))
+    submap = assembled(path, map_id, keyframes, np.array(ids, np.int64), np.array(points).reshape(-1, 3))
+    clock = cameras.clock(entries)
+    return replace(submap, localised=_localised(path, clock, begun), guessed_clock=_guesses(entries, clock))
+
+
+def _localised(path: Path, clock: Clock, begun: Begun) -> tuple[int, ...] | None:
+    """Numbers of the frames in the trajectory beside a map, which may be of another run: where its first keyframe's
+    time is not in it, nothing is known."""
+    trajectory = path.parent / "frame_trajectory.txt"
+    first = first_stamp(path)
+    if not trajectory.is_file() or first is None or len(list(path.parent.glob("*.msg"))) > 1:
+        return None
+    try:
+        times = read_tum(trajectory)[0]
+        if np.abs(times - first).min(initial=np.inf) > 1e-3:
+            return None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the clock was told with the keyframes
+            return tuple(map(frame_number, clock.names(times, trajectory, begun)))
+    except InputError:
+        return None
 
 
 def _content(path: Path) -> Mapping[str, Any]:
@@ -115,7 +142,7 @@ def _numbers(entry: Mapping[Any, Any], name: str, count: int, where: str) -> np.
 # ---- keyframes
 
 
-def _keyframe(entry: Mapping[Any, Any], where: str, cameras: _Cameras) -> Keyframe:
+def _keyframe(entry: Mapping[Any, Any], where: str, frame: str, cameras: _Cameras) -> Keyframe:
     convention = cameras.convention
     x, y, z, w = _numbers(entry, "rot_cw", 4, where)
     pose = pose_from_quaternion(np.array([w, x, y, z]), _numbers(entry, "trans_cw", 3, where), f"{where}.rot_cw")
@@ -131,15 +158,43 @@ def _keyframe(entry: Mapping[Any, Any], where: str, cameras: _Cameras) -> Keyfra
     if not np.isfinite(pixels[held]).all():
         raise InputError(f"{where}.{name}", "NaN or infinite keypoints", "expected pixels")
     camera = cameras.named(str(_field(entry, "cam", where)))
-    return convention.keyframe(_name(entry, where, convention), camera, pose, pixels[held], ids[held])
+    return convention.keyframe(frame, camera, pose, pixels[held], ids[held])
 
 
-def _name(entry: Mapping[Any, Any], where: str, convention: MapConvention) -> str:
-    if "src_frm_id" in entry:
-        return f"{_integer(entry['src_frm_id'], f'{where}.src_frm_id'):06d}.png"
-    if convention.fps is None:
-        raise InputError(f"{where}.src_frm_id", "missing", "put fps into densify_map.json to count frames by ts")
-    return frame_names(_numbers({"ts": [_field(entry, "ts", where)]}, "ts", 1, where), convention.fps, f"{where}.ts")[0]
+def _names(entries: Mapping[str, Mapping[Any, Any]], cameras: _Cameras, path: Path, begun: Begun) -> list[str]:
+    """Each keyframe's frame: by src_frm_id, which stella_vslam no longer writes, else by its time."""
+    if all("src_frm_id" in entry for entry in entries.values()):
+        return [f"{_integer(e['src_frm_id'], f'{where}.src_frm_id'):06d}.png" for where, e in entries.items()]
+    times = np.array([_time(entry, where) for where, entry in entries.items()])
+    return cameras.clock(entries).names(times, path, begun)
+
+
+def _guesses(entries: Mapping[str, Mapping[Any, Any]], clock: Clock) -> bool:
+    """Whether the keyframes' times are of a clock whose beginning had to be guessed."""
+    if all("src_frm_id" in entry for entry in entries.values()):
+        return False
+    return clock.guesses(np.array([_time(entry, where) for where, entry in entries.items()]))
+
+
+def _time(entry: Mapping[Any, Any], where: str) -> float:
+    return float(_numbers({"ts": [_field(entry, "ts", where)]}, "ts", 1, where)[0])
+
+
+def declared_rate(path: Path) -> float | None:
+    """Frames per second of a map's only camera; None where it does not tell one."""
+    section = _content(path).get("cameras")
+    entries = section.values() if isinstance(section, dict) else ()
+    rates = {entry.get("fps") for entry in entries if isinstance(entry, dict)}
+    known = [rate for rate in rates if isinstance(rate, int | float) and rate > 0]
+    return float(known[0]) if len(known) == 1 else None
+
+
+def first_stamp(path: Path) -> float | None:
+    """The first time of a map's keyframes; None where it tells none."""
+    entries = _content(path).get("keyframes")
+    values = entries.values() if isinstance(entries, dict) else ()
+    times = [entry.get("ts") for entry in values if isinstance(entry, dict)]
+    return min((float(t) for t in times if isinstance(t, int | float)), default=None)
 
 
 def _keypoints(entry: Mapping[Any, Any], where: str) -> tuple[np.ndarray, str]:
@@ -170,6 +225,16 @@ class _Cameras:
         if name not in self._known:
             self._known[name] = self._read(name)
         return self._known[name]
+
+    def clock(self, entries: Mapping[str, Mapping[Any, Any]]) -> Clock:
+        """How times are counted: as was declared, else at the rate of the camera's own section, by which the program
+        made the times of a video."""
+        clock = self.convention.clock
+        names = {str(entry.get("cam")) for entry in entries.values()}
+        section = self.section if isinstance(self.section, dict) else {}
+        rates = {section[name].get("fps") for name in names if isinstance(section.get(name), dict)}
+        known = [rate for rate in rates if isinstance(rate, int | float) and rate > 0]
+        return replace(clock, fps=float(known[0])) if clock.fps is None and len(known) == 1 else clock
 
     def _read(self, name: str) -> CameraModel:
         try:
@@ -216,7 +281,8 @@ def write_stella(submap: Submap, path: Path) -> None:
 
     Keyframes are numbered in their order, src_frm_id is their frame number. Raises InputError for a Scaramuzza lens.
     """
-    path = Path(path)
+    path, submap = Path(path), at_its_place(submap)
+    path.parent.mkdir(parents=True, exist_ok=True)
     cameras = list(dict.fromkeys(k.camera for k in submap.keyframes))
     content = {
         "cameras": {f"camera {n}": _camera_fields(camera) for n, camera in enumerate(cameras)},

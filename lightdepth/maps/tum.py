@@ -3,14 +3,15 @@
     <folder>/KeyFrameTrajectory.txt, or one *.tum or *.txt     `t tx ty tz qx qy qz qw`, map-from-camera
     <folder>/points3D.txt, or one *.ply, or one file of `x y z` lines
     <folder>/camera.json or cameras.txt                        one camera
-    <folder>/densify_map.json                                  `fps`, unless t is a frame number already
+    <folder>/densify_map.json                                  `fps`, unless t is a frame number already or the frames
+                                                               are stamped themselves; `time_offset`, where t is of
+                                                               another clock
 
 Nothing here says which keyframe observed which point. It is guessed: every point in view that no nearer one hides.
 """
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,9 +23,9 @@ from lightdepth.errors import InputError
 from lightdepth.files.colmap_cameras import read_cameras_text
 from lightdepth.files.text import is_comment, parse_numbers, text_lines
 from lightdepth.files.tum import read_tum
-from lightdepth.maps.checks import seen_by_projection
+from lightdepth.maps.checks import guessed
 from lightdepth.maps.colmap import assembled, read_points_text
-from lightdepth.maps.convention import EXPORTER, MapConvention, declared_convention, frame_names
+from lightdepth.maps.convention import EXPORTER, CameraMissing, MapConvention, Reader
 from lightdepth.sparse_map import Submap
 
 TUM = replace(EXPORTER, pose_convention="c2w")
@@ -49,37 +50,26 @@ def holds_points(folder: Path) -> bool:
     return bool(_clouds(folder))
 
 
-def read_tum_map(folder: Path) -> Submap:
+def read_tum_map(folder: Path, reader: Reader) -> Submap:
     """The folder's keyframes, named by frame number, and points; what they observed is guessed, with a warning.
 
     Raises InputError, naming the file and what to add or correct.
     """
-    trajectory = _only(_trajectories(folder), folder, "trajectories", f"name the one of the keyframes {_KEYFRAMES}")
+    found = _trajectories(folder)
+    of_keyframes = [p for p in found if "keyframe" in p.name.lower()]
+    trajectory = _only(of_keyframes or found, folder, "trajectories", f"name the one of the keyframes {_KEYFRAMES}")
     clouds = _clouds(folder)
     if not clouds:
         raise InputError(trajectory, WITHOUT_POINTS, POINTS_NEEDED)
     cloud = _only(clouds, folder, "point clouds", "leave one")
-    convention = declared_convention(folder, 0, TUM)
-    camera = _camera(folder, convention)
+    convention = reader.convention(folder, 0, TUM)
+    camera = _camera(folder, convention, reader)
     times, poses = read_tum(trajectory)
-    names = frame_names(times, convention.fps, trajectory)
+    names = convention.clock.names(times, trajectory, begun(folder))
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     keyframes = [convention.keyframe(name, camera, pose, *none) for name, pose in zip(names, poses, strict=True)]
-    return assembled(folder, 0, keyframes, *_read_cloud(cloud), check=_guessed)
-
-
-def _guessed(submap: Submap, where: Path) -> Submap:
-    try:
-        submap = seen_by_projection(submap, hide=True)
-    except InputError as error:
-        raise error.within(where) from error
-    warnings.warn(
-        f"{where}: a trajectory and a point cloud do not say which keyframe observed which point; taken to be every "
-        "point in its view that no nearer one hides. Alignment will be weaker: export the keypoints with their point "
-        "ids (COLMAP text) if you can",
-        stacklevel=2,
-    )
-    return submap
+    submap = assembled(folder, 0, keyframes, *_read_cloud(cloud), check=guessed)
+    return replace(submap, guessed_clock=convention.clock.guesses(times))
 
 
 def _only(paths: list[Path], folder: Path, what: str, cure: str) -> Path:
@@ -89,8 +79,10 @@ def _only(paths: list[Path], folder: Path, what: str, cure: str) -> Path:
 
 
 def _trajectories(folder: Path) -> list[Path]:
-    if (folder / _KEYFRAMES).is_file():
-        return [folder / _KEYFRAMES]
+    return [folder / _KEYFRAMES] if (folder / _KEYFRAMES).is_file() else _all_trajectories(folder)
+
+
+def _all_trajectories(folder: Path) -> list[Path]:
     return [p for p in _texts(folder, (".tum", ".txt")) if _columns(p) == 8]
 
 
@@ -127,13 +119,24 @@ def is_trajectory(path: Path) -> bool:
     return path.name not in _OTHERS and _columns(path) == 8
 
 
-def _camera(folder: Path, convention: MapConvention) -> CameraModel:
+def begun(folder: Path) -> tuple[float, str] | None:
+    """The first stamp of any trajectory in a folder, and the name of its file: that of all frames begins before that
+    of the keyframes, where a SLAM writes both. None where there is none."""
+    stamps = [(float(first_entry(path).split()[0]), path.name) for path in _all_trajectories(folder)]
+    return min(stamps, default=None)
+
+
+def _camera(folder: Path, convention: MapConvention, reader: Reader) -> CameraModel:
     """The folder's camera, its pixels as the map has them: camera.json says what its own are, cameras.txt does not."""
     if (folder / "camera.json").is_file():
         return convention.from_ours(read_camera(folder / "camera.json"))
     path = folder / "cameras.txt"
     if not path.is_file():
-        raise InputError(folder, "no camera", "a trajectory with points needs camera.json or cameras.txt beside them")
+        if reader.camera is not None:
+            return convention.from_ours(reader.camera)
+        raise CameraMissing(
+            folder, "no camera", "a trajectory with points needs camera.json or cameras.txt beside them"
+        )
     cameras = list(read_cameras_text(path).values())
     if len(cameras) != 1:
         raise InputError(path, f"{len(cameras)} cameras", "a trajectory does not say whose it is, expected exactly one")

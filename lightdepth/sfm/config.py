@@ -49,6 +49,9 @@ class SfmConfig:
     alike: int = 5
     """Number of frames farther off that each is also matched with, in sequential matching, those that look most like
     it; 0 for none. More find more places that are seen again, and take longer."""
+    mapper: Literal["incremental", "global", "both"] = "both"
+    """What places the matched frames: incremental, one after the other; global, all at once (GLOMAP); both, global
+    for those that incremental left, as submaps of their own where many points hold them."""
     min_model_size: int = 3
     """Least number of frames of a submap (a part of the map that hangs together, with a scale of its own); smaller ones
     are left out. More leave out more."""

@@ -6,8 +6,8 @@ connect becomes a submap of its own, with its own scale; a frame that finds no p
 Where poses are known, points are only triangulated. COLMAP knows no Scaramuzza camera: such a lens is replaced by the
 Kannala-Brandt camera that comes closest, and given back to the keyframes.
 
-With sfm.features and sfm.repair the only module that uses pycolmap. With one thread and a seed, as is the default,
-equal frames give equal maps.
+With sfm.features, sfm.mapping and sfm.repair the only module that uses pycolmap. With one thread and a seed, as is the
+default, equal frames give equal maps.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from lightdepth.native import pycolmap
 from lightdepth.sfm.config import ADVICE, Progress, SfmConfig
 from lightdepth.sfm.features import far_matches, features_and_matches, frame_file, quiet, write_images
 from lightdepth.sfm.known_poses import PosesFit, fitting_poses
+from lightdepth.sfm.mapping import mapped, mapping_options, write_model
 from lightdepth.sfm.unmapped import reasons, summary
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap, check_rigid
 
@@ -83,7 +84,7 @@ def sparse_map_from_frames(
         matching = features_and_matches(Path(work), camera, names, config, progress)
         fitting = None
         if known is None:
-            count = _reconstruct(Path(work), len(names), config, progress)
+            count = mapped(Path(work), names, config, progress)
         else:
             fitting = fitting_poses(far_matches(Path(work), sorted(known), _JUDGED), known, camera, turn_of(fit))
             if fitting.poor:
@@ -149,33 +150,6 @@ def fisheye_fit(camera: CameraModel, valid: np.ndarray) -> Conversion:
     return fit
 
 
-def _reconstruct(work: Path, count: int, config: SfmConfig, progress: Progress) -> int:
-    """Maps what work/database.db holds; writes the models as text to work/models/<i>, returns how many."""
-    pc = pycolmap()
-    registered = 0
-
-    def one_more() -> None:
-        nonlocal registered
-        registered = min(registered + 1, count)
-        progress("mapping", registered, count)
-
-    (work / "colmap").mkdir()
-    with quiet(pc):
-        models = pc.incremental_mapping(
-            work / "database.db",
-            work / "images",
-            work / "colmap",
-            mapping_options(pc, config),
-            next_image_callback=one_more,
-        )
-        large = [m for m in models.values() if m.num_reg_images() >= config.min_model_size]
-        large = [m for m in large if m.num_points3D() >= config.min_points]
-        for index, model in enumerate(sorted(large, key=lambda m: -m.num_reg_images())):
-            _write_model(model, work, index)
-    progress("mapping", count, count)
-    return len(large)
-
-
 def _triangulated(work: Path, known: Mapping[str, np.ndarray], config: SfmConfig, progress: Progress) -> int:
     """Triangulates the matches at known cam_from_map (4, 4) by file name; writes the model, returns 1, or 0 without."""
     pc = pycolmap()
@@ -185,7 +159,7 @@ def _triangulated(work: Path, known: Mapping[str, np.ndarray], config: SfmConfig
         model = triangulated_anew(model_at_poses(work, known), work, mapping_options(pc, config))
         if model.num_points3D() < config.min_points:
             return 0
-        _write_model(model, work, 0)
+        write_model(model, work, 0)
     progress("mapping", len(known), len(known))
     return 1
 
@@ -215,26 +189,6 @@ def triangulated_anew(model: Any, work: Path, options: Any) -> Any:
         options=options,
         refine_intrinsics=False,
     )
-
-
-def _write_model(model: Any, work: Path, index: int) -> None:
-    folder = work / "models" / str(index)
-    folder.mkdir()
-    model.write_text(folder)
-
-
-def mapping_options(pc: Any, config: SfmConfig) -> Any:
-    options = pc.IncrementalPipelineOptions()
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = config.seed
-    options.num_threads = options.mapper.num_threads = config.num_threads
-    options.multiple_models, options.min_model_size = True, config.min_model_size
-    # The calibration is given: refining it on a short endoscopic sequence would trade it against the shape.
-    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
-    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    options.mapper.init_min_tri_angle = config.init_min_tri_angle
-    options.mapper.init_min_num_inliers = config.init_min_num_inliers
-    options.mapper.init_max_forward_motion = 1.0  # an endoscope moves forward: COLMAP would refuse such first pairs
-    return options
 
 
 def with_camera(submap: Submap, camera: CameraModel, rotation: np.ndarray) -> Submap:

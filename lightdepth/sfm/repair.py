@@ -7,7 +7,7 @@ mapping that knows no poses is made besides, for maps that are too far off. Of t
 keyframes, and then more observations closer to their points, is brought to the map's frame and scale. The calibration
 stays as it is.
 
-With sfm.features and sfm.reconstruction the only module that uses pycolmap.
+With sfm.features, sfm.mapping and sfm.reconstruction the only module that uses pycolmap.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from lightdepth.maps.colmap import read_submap
 from lightdepth.native import pycolmap
 from lightdepth.sfm.config import Progress, SfmConfig
 from lightdepth.sfm.features import features_and_matches, frame_file, quiet, write_images
+from lightdepth.sfm.mapping import mapping_options
 from lightdepth.sfm.reconstruction import (
     fisheye_fit,
-    mapping_options,
     model_at_poses,
     silent,
     triangulated_anew,
@@ -121,7 +121,9 @@ def repaired_submap(
         _bring_to(model, given)
         model.write_text(work / "model")
         (work / "model").rename(out_folder)
-        new = read_submap(out_folder, submap.id)
+        new = replace(read_submap(out_folder, submap.id), origin=submap.origin)
+        if any(new.origin):
+            write_text_model(new, out_folder)  # where the old one lies
     if fit:
         new = with_camera(new, written.camera, fit.rotation)
     return new, Repair(

@@ -13,6 +13,7 @@ import yaml
 from jsonargparse import ArgumentParser, Namespace
 
 from lightdepth.command_line.presets import shipped
+from lightdepth.command_line.settings_yaml import read_settings
 from lightdepth.errors import InputError
 from lightdepth.reporting.run import plain
 
@@ -113,7 +114,7 @@ def plans_of(
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        values = yaml.safe_load(path.read_text())
+        values = read_settings(path)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(
             path, f"cannot be read as a training preset ({error})", "expected a YAML like configs/train/*.yaml"

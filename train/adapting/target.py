@@ -11,12 +11,13 @@ import torch
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
+from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
+from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
 from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
 from lightdepth.losses import LossConfig
-from lightdepth.maps import read_map
 from lightdepth.models import NetworkModel
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.reporting.run import Run
@@ -68,13 +69,13 @@ def read_target(
 ) -> Target:
     """The frames and their map, given or made. Where nobody gave a light, the map's points may tell it; what was used
     is written."""
-    sparse_map, unjudged = read_map(map) if map is not None else None, ""
-    map_camera = sparse_map.submaps[0].keyframes[0].camera if sparse_map is not None else None
-    frames = source.open(map_camera)
+    unjudged = ""
+    sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, pairing)
     run.hash_inputs(**source.files, map=map)
     training, held = parted(frames, config.held_out)
     check_exposed((training, held))
     if sparse_map is not None:
+        sparse_map = by_the_images(sparse_map, frames)
         check_shared_frames(sparse_map, frames)
         check_pairing(sparse_map, frames, pairing, run, frames[0].camera if source.camera is not None else None)
         write_camera(frames[0].camera, run.folder / "camera.json")

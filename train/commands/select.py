@@ -17,9 +17,10 @@ import numpy as np
 
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
+from lightdepth.datasets.with_map import open_with_map
 from lightdepth.errors import InputError
 from lightdepth.files.writing import Content, write_together
-from lightdepth.maps import read_map
+from lightdepth.maps.convention import MapReading
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.report import Report
@@ -65,6 +66,7 @@ def select(
     camera: Path | None = None,
     mask: Path | None = None,
     config: Group[SelectConfig] = SelectConfig(),
+    reading: Group[MapReading] = MapReading(),
     with_folder: bool = False,
     no_frames: bool = False,
     overwrite: bool = False,
@@ -92,9 +94,8 @@ def select(
         overwrite: Replace the files of an earlier run. Without it, files that are already there are refused.
     """
     paths = _paths(output, no_frames, overwrite)
-    sparse_map = read_map(map) if map is not None else None
-    map_camera = sparse_map.submaps[0].keyframes[0].camera if sparse_map is not None else None
-    frames = SequenceSource(data, format, camera, mask=mask).open(map_camera)
+    source = SequenceSource(data, format, camera, mask=mask)
+    sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, reading)
     settings: dict[str, object]
     if sparse_map is not None and map is not None:
         verdicts, how = _by_map(frames, sparse_map, map, config.map_rules)

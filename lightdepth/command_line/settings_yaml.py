@@ -1,0 +1,30 @@
+"""YAML of settings: `judge: {on: false}`, where YAML 1.1 takes a bare `on` for the value true."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from jsonargparse import get_loader, set_loader
+
+_WORDS = {True: "on", False: "off"}
+_library = get_loader("yaml")
+
+
+def read_settings(file: Path) -> Any:
+    """What a file of settings holds. Raises OSError, UnicodeDecodeError or yaml.YAMLError."""
+    return with_words(yaml.safe_load(file.read_text(encoding="utf-8")))
+
+
+def use_words() -> None:
+    """From here on jsonargparse reads its YAML so, too."""
+    set_loader("yaml", lambda text: with_words(_library(text)), exceptions=(yaml.YAMLError,))
+
+
+def with_words(value: Any) -> Any:
+    """The same with keys that are words again where YAML took them for true and false."""
+    if isinstance(value, Mapping):
+        return {(_WORDS[k] if isinstance(k, bool) else k): with_words(v) for k, v in value.items()}
+    return [with_words(v) for v in value] if isinstance(value, list) else value

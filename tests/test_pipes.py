@@ -1,0 +1,62 @@
+"""A reader of a verb's output that leaves, and settings that YAML reads as something else."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from test_cli import SMALL, lightdepth
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("piped") / "seq"
+    argv = ["--frames", 8, "--size", "[96, 80]", "--travel-mm", 10, "--lens", "pinhole", "--slam.keyframe-every", 1]
+    assert lightdepth("synth", "-o", folder, *argv, *SMALL) == 0
+    return folder
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_run_stands_when_nobody_reads_what_it_says(data, tmp_path, monkeypatch, stream):
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w", buffering=1) as gone:
+        monkeypatch.setattr(sys, stream, gone)
+        assert lightdepth("predict", data, "--checkpoint", "decline", "-o", tmp_path / "run") == 0
+        monkeypatch.undo()
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["failures"] == []
+    assert len(list((tmp_path / "run").rglob("*.npz"))) == 8 and not list(tmp_path.glob(".run-*"))
+
+
+@pytest.mark.parametrize("group", ["judge", "judge.parallax", "bending"])
+def test_a_switch_is_read_from_yaml_without_quotes(group, tmp_path, capsys):
+    text = "on: false"
+    for name in reversed(group.split(".")):
+        text = f"{name}: {{{text}}}"
+    (tmp_path / "settings.yaml").write_text(text)
+    for config in (tmp_path / "settings.yaml", text):
+        assert lightdepth("densify", "frames", "-o", "out", "--config", config, "--print_config") == 0
+        shown = capsys.readouterr().out
+        assert f"{group}: on is False" in _switches(shown), shown
+
+
+def _switches(text: str) -> list[str]:
+    """The switches of printed settings, each with its group and what it is."""
+    import yaml
+
+    def below(node: object, above: str) -> list[str]:
+        if not isinstance(node, dict):
+            return []
+        own = [f"{above}: on is {value}" for key, value in node.items() if key in ("on", True)]
+        return own + [s for key, value in node.items() for s in below(value, f"{above}.{key}".lstrip("."))]
+
+    return below(yaml.safe_load(text), "")
+
+
+def test_a_mistyped_setting_beside_a_switch_is_still_named(tmp_path, capsys):
+    (tmp_path / "settings.yaml").write_text("judge:\n  on: false\n  fold: 3\n")
+    assert lightdepth("densify", "frames", "-o", "out", "--config", tmp_path / "settings.yaml") == 2
+    assert "judge.fold" in capsys.readouterr().err
