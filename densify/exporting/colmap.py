@@ -2,12 +2,14 @@
 
     sparse/0/           cameras, images, points3D as text: the map's points with their tracks, the surface's without
     dense/              all as an undistorted pinhole camera has it, which is what COLMAP's stereo knows
-      sparse/           the same model, keypoints moved with the pixels
+      sparse/           the same model, keypoints moved with the pixels; all half a pixel up and left, see below
       images/           the frames, where they are given
       stereo/depth_maps, normal_maps/NAME.geometric.bin, patch-match.cfg, fusion.cfg
 
 The array files are COLMAP's: `width&height&channels&`, then float32, a channel after the other, rows from the top.
-Depth is along the axis, 0 where the surface is not seen; normals are in camera axes.
+Depth is along the axis, at the pixels' centres, 0 where the surface is not seen; normals are in camera axes. COLMAP's
+stereo and fusion take the pixel of index (0, 0) to be at (0, 0), where its models have (0.5, 0.5): with the model's own
+principal point the fused points are half a pixel beside the surface.
 """
 
 from __future__ import annotations
@@ -60,7 +62,8 @@ def write_colmap(exported: Exportable, folder: Path, frames: FrameSequence | Non
     colors = np.concatenate([np.full((len(exported.submap.points), 3), 128, np.uint8), exported.colors[rows]])
     write_text_model(model, folder / "sparse" / "0", colors=colors)
     undistorted = tuple(_undistorted(k) for k in named)
-    write_text_model(replace(model, keyframes=undistorted), folder / "dense" / "sparse", colors=colors)
+    by_index = tuple(replace(k, camera=k.camera.with_pixel_center(1.0), pixels=k.pixels - 0.5) for k in undistorted)
+    write_text_model(replace(model, keyframes=by_index), folder / "dense" / "sparse", colors=colors)
     stereo = folder / "dense" / "stereo"
     for kind in ("depth_maps", "normal_maps", "consistency_graphs"):
         (stereo / kind).mkdir(parents=True)

@@ -68,7 +68,7 @@ def main(model: str, image_file: str, camera_file: str, out: str, mask_file: str
     settings = json.loads((Path(model).parent / "model.json").read_text())
     camera = json.loads(Path(camera_file).read_text())
     image = np.asarray(Image.open(image_file).convert("RGB"), np.float64) / 255
-    mask = np.ones(image.shape[:2]) if mask_file is None else np.asarray(Image.open(mask_file).convert("L")) > 127
+    mask = np.ones(image.shape[:2], bool) if mask_file is None else np.asarray(Image.open(mask_file).convert("L")) > 127
     width, height = settings["size"] or (round(image.shape[1] * settings["rows"] / image.shape[0]), settings["rows"])
     full = rays_of(camera, image.shape[1], image.shape[0])[1]
     rays, there = rays_of(camera, width, height)

@@ -47,5 +47,6 @@ def export_depth(run: Run, folder: Path, to: str, step: float | None) -> None:
         else:
             write_exr(run.folder / f"{file.stem}.exr", depth)
     run.record.update({"kind": "depth along the axis", "unit": unit, "step": chosen if to == "png" else None})
-    codes = f"; one code is {chosen:g}: read with --depth-kind depth --depth-scale {chosen:g}" if to == "png" else ""
+    scale = f" --depth-scale {chosen:g}" if unit == "mm" else ""
+    codes = f"; one code is {chosen:g} (evaluate --depth-kind depth{scale})" if to == "png" else ""
     run.log(f"{len(files)} files of depth along the axis, {unit}, 0 where unknown{codes}")
