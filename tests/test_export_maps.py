@@ -238,6 +238,11 @@ def test_without_its_map_and_frames_a_run_is_still_exported_and_what_is_missing_
     assert "no tracks" in said and "frames are not found" in said
     rebuilt = native.pycolmap().Reconstruction(tmp_path / "out" / "map_000" / "sparse" / "0")
     assert len(rebuilt.images) == 8 and all(p.track.length() == 0 for p in rebuilt.points3D.values())
+    (run / "data").mkdir()
+    (run / "data" / "slam").symlink_to(place / "map")  # a demo's run has them inside
+    (run / "run.json").write_text(json.dumps({"unit": "mm", "arguments": {"mm_per_unit": MM}}))
+    assert read_exportables(run)[0].tracked
+    (run / "run.json").write_text(json.dumps({"unit": "mm"}))
     tracked = ["--map", str(place / "map"), "--data", str(place / "data")]
     assert main(["export", str(run), "-o", str(tmp_path / "out2"), "--to", "colmap", *tracked]) == 3
     assert "not the map that map_000 was made of" in capsys.readouterr().err  # the unit of the run is not said

@@ -60,8 +60,14 @@ def export(what: Path | str, out: Path, *options: str) -> Path:
 def traced_once():
     """Tracing takes seconds, and both graphs of the checkpoint begin with it."""
     kept, traced = {}, graph.traced
+
+    def once(network, rows, size=None):
+        if size is None:
+            return traced(network, rows)
+        return kept.get(size) or kept.setdefault(size, traced(network, rows, size))
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(graph, "traced", lambda *of: kept.get(of[2]) or kept.setdefault(of[2], traced(*of)))
+        patch.setattr(graph, "traced", once)
         yield
 
 

@@ -133,6 +133,8 @@ def _submaps(run: Path, record: Mapping[str, object], given: Path | None) -> dic
         found = read_map(run / "sparse")
     elif isinstance(named, str) and Path(named).exists():
         found = read_map(named)
+    elif (run / "data" / "slam").is_dir():  # where `demo` has it
+        found = read_map(run / "data" / "slam")
     if found is None:
         return {}
     camera = read_dense_map(map_folders(run)[0]).camera

@@ -76,7 +76,9 @@ def _frames(run: Run, source: Path, given: Path | None) -> FrameSequence | None:
     """The frames that a run was made of: those given, or those that it names, where they are still there."""
     arguments = run_record(source).get("arguments")
     named = arguments if isinstance(arguments, Mapping) else {}
-    path = given or (Path(str(named["data"])) if named.get("data") else None)
+    folder = map_folders(source)[0].parent
+    beside = folder / "data" if (folder / "data").is_dir() else None  # where `demo` has them
+    path = given or (Path(str(named["data"])) if named.get("data") else beside)
     if path is None or not path.exists():
         run.warn(
             f"the run's frames are not found{f' ({path})' if path else ''}: no pictures, times or masks; give --data"
