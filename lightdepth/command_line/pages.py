@@ -149,16 +149,16 @@ PAGES = {
             "lightdepth bench estimators -o runs/estimators --draws 200 --points 50",
         )
     ),
-    "export": Page(
-        (
-            "lightdepth export runs/dense -o runs/colmap --to colmap",
-            "lightdepth export runs/mine/model.safetensors -o runs/onnx --to onnx",
-        )
-    ),
     "measure": Page(
         (
             "lightdepth measure runs/dense --points '[[0, 0, 30], [4, 2, 41]]' --mm-per-unit 3.1",
             "lightdepth measure runs/dense --frame 120 --pixels '[[310, 200], [420, 260]]'",
+        )
+    ),
+    "export": Page(
+        (
+            "lightdepth export runs/dense -o runs/colmap --to colmap",
+            "lightdepth export runs/mine/model.safetensors -o runs/onnx --to onnx",
         )
     ),
 }
