@@ -19,6 +19,7 @@ from densify.exporting.colmap import read_array, write_colmap
 from densify.exporting.exported import Exportable, read_exportables
 from densify.exporting.images import pinhole_of
 from densify.exporting.nerfstudio import intrinsics, write_nerfstudio
+from densify.fusion.volume import FusionConfig
 from densify.judging.config import JudgeConfig
 from densify.pipeline import densify
 from lightdepth import native
@@ -40,7 +41,7 @@ def made(folder: Path, camera: CameraModel, mm_per_unit: float | None = None) ->
     found = slam(frames, maps=1, spurious=0.1).map
     write_folder(frames, folder / "data")
     write_text_model(found.submaps[0], folder / "map")
-    config = DensifyConfig(judge=JudgeConfig(on=False))
+    config = DensifyConfig(judge=JudgeConfig(on=False), fusion=FusionConfig(voxels_per_distance=20.0))
     dense = densify(sequence(frames), read_map(folder / "map"), truth, config)[0].dense
     dense.write(folder / "run" / "map_000", mm_per_unit=mm_per_unit)
     arguments = {"data": str(folder / "data"), "map": str(folder / "map"), "mm_per_unit": mm_per_unit}
