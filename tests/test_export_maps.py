@@ -27,9 +27,10 @@ from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, Scaram
 from lightdepth.cli import main
 from lightdepth.datasets import write_folder
 from lightdepth.files.tum import read_tum
-from lightdepth.maps import read_map
+from lightdepth.maps import read_map, write_multimap
 from lightdepth.maps.colmap import write_text_model
 from lightdepth.maps.endocartoscope import read_trajectory
+from lightdepth.sparse_map import SparseMap
 
 FISHEYE = KannalaBrandt(96, 80, 52.0, 51.0, 47.0, 41.0, -0.05, 0.01, 0.0, 0.0)
 MM = 2.5
@@ -193,6 +194,19 @@ def test_climb_s_tree_counts_from_one_and_says_how_long_it_took(place, exported)
     assert np.abs(again.reprojection_errors() - exported.submap.reprojection_errors()).max() < 1e-6
     poses = read_trajectory(folder / "camera_trajectory" / "cam_traj_map_000.txt")
     assert poses[0].name == "000001.png" and len(poses) == 8 and poses[1].time > 0
+
+
+def test_climb_s_tree_has_every_frame_that_the_slam_localised(place, exported, tmp_path):
+    tree = tmp_path / "slam"
+    submap = read_map(place / "map").submaps[0]
+    between = {f"{100 + i:06d}.png": k.cam_from_map for i, k in enumerate(submap.keyframes)}
+    write_multimap(SparseMap((submap,), "made"), tree, {0: between}, times={name: 7.5 for name in between})
+    out = tmp_path / "out"
+    assert main(["export", str(place / "run"), "-o", str(out), "--to", "climb", "--map", str(tree)]) == 0
+    poses = read_trajectory(out / "camera_trajectory" / "cam_traj_map_000.txt")
+    assert [p.name for p in poses[8:]] == [f"{101 + i:06d}.png" for i in range(8)] and len(poses) == 16
+    assert [p.is_keyframe for p in poses] == [True] * 8 + [False] * 8 and poses[8].time == 7.5
+    assert np.allclose(poses[8].cam_from_map, exported.submap.keyframes[0].cam_from_map, atol=1e-7)
 
 
 def under(exported: Exportable, camera: CameraModel) -> Exportable:

@@ -18,7 +18,8 @@ from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.geometry import depth_from_distance
 from lightdepth.maps import read_map
-from lightdepth.sparse_map import Keyframe, SparseMap, Submap
+from lightdepth.maps.endocartoscope import TrajectoryPose, read_trajectory, trajectory_path
+from lightdepth.sparse_map import Keyframe, Submap
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +27,8 @@ class Exportable:
     """One dense map, all of it in the surface's unit ("mm" or "map units").
 
     colors (n, 3) uint8 and normals (n, 3) of the vertices; the submap's points are those of sparse.ply. `tracked` is
-    whether its keyframes have their observations: they do where the map that the run was made of was found.
+    whether its keyframes have their observations: they do where the map that the run was made of was found. `localised`
+    are all frames that the SLAM has a pose of, where its tree says so.
     """
 
     name: str
@@ -36,6 +38,7 @@ class Exportable:
     submap: Submap
     tracked: bool
     unit: str
+    localised: tuple[TrajectoryPose, ...] = ()
 
     @cached_property
     def surface(self) -> Surface:
@@ -76,20 +79,22 @@ def read_exportables(run: Path, sparse: Path | None = None) -> list[Exportable]:
         raise InputError(run, "no map_* folders in it", "expected a densify run, or one of its map folders")
     folders += [] if folders == [run] else sorted(p for p in run.glob("joined_*") if p.is_dir())
     record = run_record(run)
-    submaps = _submaps(folders[0].parent, record, sparse)
-    return [_exportable(folder, record, submaps, given=sparse) for folder in folders]
+    path = sparse or _map_of(folders[0].parent, record)
+    submaps = {} if path is None else _submaps(path, folders[0], record)
+    return [_exportable(folder, record, submaps, path, given=sparse) for folder in folders]
 
 
 def _exportable(
-    folder: Path, record: Mapping[str, object], submaps: Mapping[int, Submap], given: Path | None
+    folder: Path, record: Mapping[str, object], submaps: Mapping[int, Submap], path: Path | None, given: Path | None
 ) -> Exportable:
     dense = read_dense_map(folder)
     if not len(dense.triangles):
         raise InputError(folder, "its surface is empty", "export the others one by one")
     submap = submaps.get(dense.id) if not folder.name.startswith("joined_") else None
-    scale = _argument(record, "mm_per_unit")
-    if submap is not None and isinstance(scale, (int, float)) and scale:
-        submap = in_unit(submap, float(scale))
+    asked = _argument(record, "mm_per_unit")
+    scale = float(asked) if isinstance(asked, (int, float)) and asked else 1.0
+    if submap is not None:
+        submap = in_unit(submap, scale)
     if submap is not None and not _is_of(submap, dense):
         if given is not None:
             raise InputError(given, f"not the map that {folder.name} was made of", "give that map, or leave it out")
@@ -104,6 +109,7 @@ def _exportable(
         submap=submap or _without_observations(folder, dense),
         tracked=submap is not None,
         unit=unit if isinstance(unit, str) else "map units",
+        localised=_localised(path, submap.id, scale) if submap is not None and path is not None else (),
     )
 
 
@@ -123,23 +129,35 @@ def _argument(record: Mapping[str, object], name: str) -> object:
     return arguments.get(name) if isinstance(arguments, Mapping) else None
 
 
-def _submaps(run: Path, record: Mapping[str, object], given: Path | None) -> dict[int, Submap]:
-    """The submaps that the run was made of, at the size of its frames, by id; none where they are not found."""
+def _map_of(run: Path, record: Mapping[str, object]) -> Path | None:
+    """The map that a run was made of, where it is still there."""
+    if (run / "sparse").is_dir():  # made by the run, or made anew
+        return run / "sparse"
     named = _argument(record, "map")
-    found: SparseMap | None = None
-    if given is not None:
-        found = read_map(given)
-    elif (run / "sparse").is_dir():  # made by the run, or made anew
-        found = read_map(run / "sparse")
-    elif isinstance(named, str) and Path(named).exists():
-        found = read_map(named)
-    elif (run / "data" / "slam").is_dir():  # where `demo` has it
-        found = read_map(run / "data" / "slam")
-    if found is None:
-        return {}
-    camera = read_dense_map(map_folders(run)[0]).camera
-    fitted = fitted_to_frames(found, camera.width, camera.height, camera if _argument(record, "camera") else None)
+    if isinstance(named, str) and Path(named).exists():
+        return Path(named)
+    inside = run / "data" / "slam"  # where `demo` has it
+    return inside if inside.is_dir() else None
+
+
+def _submaps(path: Path, folder: Path, record: Mapping[str, object]) -> dict[int, Submap]:
+    """The submaps of a map by id, at the size of the frames that the run's map folder is of."""
+    camera = read_dense_map(folder).camera
+    given = camera if _argument(record, "camera") else None
+    fitted = fitted_to_frames(read_map(path), camera.width, camera.height, given)
     return {submap.id: submap for submap in fitted.submaps}
+
+
+def _localised(path: Path, map_id: int, scale: float) -> tuple[TrajectoryPose, ...]:
+    """All localised frames of a map in the tree of EndoCartoScope or CLiMB, in the surface's unit; none elsewhere."""
+    files = sorted(path.rglob(trajectory_path(path, map_id).name)) if path.is_dir() else []
+
+    def moved(pose: TrajectoryPose) -> TrajectoryPose:
+        cam_from_map = pose.cam_from_map.copy()
+        cam_from_map[:3, 3] *= scale
+        return replace(pose, cam_from_map=cam_from_map)
+
+    return tuple(map(moved, read_trajectory(files[0]))) if len(files) == 1 else ()
 
 
 def _is_of(submap: Submap, dense: DenseMapFiles) -> bool:
