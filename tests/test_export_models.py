@@ -175,6 +175,20 @@ def test_a_graph_that_differs_is_refused(checkpoint, tmp_path, monkeypatch, caps
     assert "differs from the network by 0.1" in capsys.readouterr().err and not (tmp_path / "o").exists()
 
 
+def test_a_graph_that_takes_one_size_alone_is_refused_for_any(checkpoint, tmp_path, monkeypatch, capsys):
+    def one_size(*_):
+        raise RuntimeError("expected 48")
+
+    for name in ("traced", "write_torch"):
+        monkeypatch.setattr(graph, name, lambda *_: None)
+    monkeypatch.setattr(graph, "run_torch", one_size)
+    assert main(["export", str(checkpoint), "-o", str(tmp_path / "o"), "--to", "torch"]) == 3
+    assert "give --size, the only one" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    assert main(["export", str(checkpoint), "-o", str(tmp_path / "o"), "--to", "onnx"]) == 3
+    assert "pip install 'lightdepth[onnx]'" in capsys.readouterr().err
+
+
 def test_a_folder_for_a_hub_comes_back_by_from_pretrained_and_by_every_verb(checkpoint, tmp_path):
     folder = export(checkpoint, tmp_path / "mine", "--to", "safetensors", "--no-half")
     first, model = load_model(checkpoint), from_pretrained(folder)

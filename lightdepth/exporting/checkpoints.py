@@ -71,7 +71,11 @@ def write_graph(model: NetworkModel, folder: Path, kind: GraphKind, size: tuple[
     off = 0.0
     for height, width, count in sizes:
         inputs = graph.example_inputs(height, width, count)
-        off = max(off, graph.difference(run(path, inputs), graph.module_outputs(network, inputs)))
+        try:
+            found = run(path, inputs)
+        except Exception as error:  # whatever a runtime says of a graph that took its first size for the only one
+            raise InputError(path, f"it takes no image of {width}x{height}", "give --size, the only one") from error
+        off = max(off, graph.difference(found, graph.module_outputs(network, inputs)))
     if not off <= graph.TOLERANCE:
         raise InputError(
             path, f"it differs from the network by {off:.2g}", f"expected at most {graph.TOLERANCE:g}; try another kind"
