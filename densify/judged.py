@@ -10,6 +10,7 @@ from pathlib import Path
 from densify.config import DensifyConfig
 from densify.dense_map import map_folders
 from densify.densified import Densified
+from densify.evaluation.depth_files import DepthReading
 from densify.evaluation.judge import THRESHOLDS_MM, judge_maps
 from densify.evaluation.judge_depth import judge_depth
 from densify.evaluation.judged_map import (
@@ -103,6 +104,8 @@ class Asked:
     """how errors are taken"""
     trajectory: Path | None
     """every localised frame of the maps, in place of their keyframes"""
+    reading: DepthReading
+    """what the files of a folder of predictions are"""
     suite: Suite | None = None
     """which sequences stand in one table; None for a single one"""
     pairs: Mapping[str, tuple[Path, Path]] = field(default_factory=dict)
@@ -119,13 +122,17 @@ def read_asked(
     suite: Path | None = None,
     trajectory: Path | None = None,
     in_place: bool = False,
+    reading: DepthReading = DepthReading(),
 ) -> Asked:
     """Raises InputError where the options do not go together. `in_place` is whether the metrics go into the run."""
     truth = source.truth
     if not run.exists():
         raise InputError(run, "no such folder or file", "expected a run, predictions, a map or a trajectory")
-    if in_place and not is_made_by_us(run):
+    other = reading.depth_kind is not None
+    if in_place and (other or not is_made_by_us(run)):
         raise InputError(run, "not a folder of this program", "add -o FOLDER for the metrics")
+    if other and truth is None:
+        raise InputError("--depth-kind", "given without --truth", "give --truth DATA, a sequence with true depth")
     if truth is None and join is None and not withheld_errors(run):
         raise InputError(
             "--truth",
@@ -140,12 +147,12 @@ def read_asked(
             "it needs --truth, and goes with none of these",
         )
     if truth is None:
-        return Asked(run, source, config, trajectory)
+        return Asked(run, source, config, trajectory, reading)
     if suite is None:
-        return Asked(run, source, config, trajectory, pairs={truth.name: (run, truth)})
+        return Asked(run, source, config, trajectory, reading, pairs={truth.name: (run, truth)})
     columns = read_suite(shipped(suite))
     pairs, missing = present(columns, run, truth)
-    return Asked(run, source, config, trajectory, columns, pairs, missing)
+    return Asked(run, source, config, trajectory, reading, columns, pairs, missing)
 
 
 @dataclass(frozen=True)
@@ -170,10 +177,10 @@ def judge_asked(asked: Asked, model: DepthModel | None, out: Run) -> Answer:
         out.fail(name, reason)
     for name, (judged, folder) in asked.pairs.items():
         try:
-            if judged.is_dir() and any(judged.glob("*.npz")):
+            if asked.reading.depth_kind is not None or (judged.is_dir() and any(judged.glob("*.npz"))):
                 frames = asked.source.sequence(folder).open()
                 check_truth(frames, asked.config.trust_truth)
-                found[name] = judge_depth(judged, frames, asked.config.max_depth_mm, asked.config.common)
+                found[name] = judge_depth(judged, frames, asked.config.max_depth_mm, asked.config.common, asked.reading)
                 continue
             frames, maps, points = _maps(asked, name, model, out)
             withheld += [replace(entry, sequence=name) for entry in points] if asked.suite else points

@@ -10,6 +10,7 @@ from lightdepth.moved import install as install_moved
 
 if TYPE_CHECKING:
     from lightdepth.camera import CameraModel as CameraModel
+    from lightdepth.checkpoint import from_pretrained as from_pretrained
     from lightdepth.checkpoint import load_model as load_model
     from lightdepth.datasets import FrameSequence as FrameSequence
     from lightdepth.datasets import open_sequence as open_sequence
@@ -34,6 +35,7 @@ _HOMES = {
     "InputError": "lightdepth.errors",
     "PhotometricCalibration": "lightdepth.photometry",
     "SparseMap": "lightdepth.sparse_map",
+    "from_pretrained": "lightdepth.checkpoint",
     "load_model": "lightdepth.checkpoint",
     "open_sequence": "lightdepth.datasets",
     "predict": "lightdepth.models",

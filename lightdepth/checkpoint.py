@@ -2,11 +2,15 @@
 
 The metadata of the file holds, as JSON, `network` (NetworkConfig) and `card` (what it was trained on, its working
 `rows`, its errors). Weights are stored in float16 unless asked otherwise, and used in float32.
+
+A folder with `model.safetensors` is a checkpoint too, as hubs keep them; `config.json` in it has the same two objects,
+and stands in for the metadata of weights that another program wrote anew.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +20,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from lightdepth.errors import InputError
+from lightdepth.files.schema import read_json
 from lightdepth.files.writing import write_whole
 from lightdepth.models import ConstantModel, DeclineModel, DepthModel, NetworkModel
 from lightdepth.network import DepthNetwork, NetworkConfig, build_network
@@ -26,13 +31,25 @@ TRAINING_FREE: dict[str, type[DeclineModel] | type[ConstantModel]] = {
     "constant": ConstantModel,
 }
 
+WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
+"""What a folder holds that is a checkpoint."""
+HUB = "hf://"
+"""Before the id of a checkpoint on the Hugging Face hub, where one is named on the command line."""
+
 _WEIGHTS = Path(__file__).parent / "weights"
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _DEFAULT_ROWS = 128
 
 
 def bundled() -> list[str]:
     """Names of the checkpoints that come with the program."""
     return sorted(path.stem for path in _WEIGHTS.glob("*.safetensors"))
+
+
+def bundled_card(name: str) -> str | None:
+    """The page on a bundled checkpoint, or None for others."""
+    page = _WEIGHTS / f"{name}.md"
+    return page.read_text(encoding="utf-8") if name in bundled() and page.is_file() else None
 
 
 def save_model(network: DepthNetwork, path: Path | str, card: dict[str, Any], half: bool = True) -> None:
@@ -48,7 +65,8 @@ def save_model(network: DepthNetwork, path: Path | str, card: dict[str, Any], ha
 
 
 def load_model(name_or_path: str | Path = DEFAULT_CHECKPOINT, details: bool = True) -> DepthModel:
-    """The model of that name: `decline`, `constant`, a bundled checkpoint, a .safetensors file or a Lightning .ckpt.
+    """The model of that name: `decline`, `constant`, a bundled checkpoint, a .safetensors file, a folder with
+    model.safetensors, a Lightning .ckpt, or `hf://OWNER/NAME`, which `from_pretrained` fetches.
 
     `details` False leaves out albedo and normals, where only distance is wanted. Raises InputError when there is no
     such checkpoint or it cannot be used.
@@ -60,16 +78,51 @@ def load_model(name_or_path: str | Path = DEFAULT_CHECKPOINT, details: bool = Tr
         return ConstantModel()
     if name in bundled():
         return _placed(_load_safetensors(_WEIGHTS / f"{name}.safetensors", name, details))
+    if name.startswith(HUB):
+        return from_pretrained(name.removeprefix(HUB), details)
     path = Path(name_or_path)
+    if (path / WEIGHTS_FILE).is_file():
+        return _placed(_load_safetensors(path / WEIGHTS_FILE, path.resolve().name, details))
     if not path.is_file():
         known = ", ".join([*bundled(), *TRAINING_FREE])
-        what = "is a folder" if path.is_dir() else "no such checkpoint"
+        what = f"is a folder without {WEIGHTS_FILE}" if path.is_dir() else "no such checkpoint"
         raise InputError(name, what, f"expected a .safetensors or .ckpt file, or one of {known}")
     if path.suffix == ".safetensors":
         return _placed(_load_safetensors(path, path.stem, details))
     if path.suffix == ".ckpt":
         return _placed(_load_lightning(path, details))
     raise InputError(name, "unknown kind of checkpoint", "expected a name that ends in .safetensors or .ckpt")
+
+
+def from_pretrained(path_or_id: str | Path, details: bool = True, revision: str | None = None) -> DepthModel:
+    """The model of a checkpoint's folder or file, or of the id OWNER/NAME of such a folder on the Hugging Face hub.
+
+    What lies at the path wins; the network is asked for an id alone, whose files are kept by `huggingface_hub` (extra
+    `hub`). Raises InputError as `load_model` does, and where nothing can be fetched.
+    """
+    name = str(path_or_id).removeprefix(HUB)
+    if Path(path_or_id).exists() or not _HUB_ID.fullmatch(name):
+        return load_model(path_or_id, details)
+    return load_model(_fetched(name, revision), details)
+
+
+def _fetched(hub_id: str, revision: str | None) -> Path:
+    """The folder that a checkpoint of the hub is kept in."""
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError as error:
+        raise InputError(
+            hub_id, "no such path, and huggingface_hub is not installed", "pip install 'lightdepth[hub]'"
+        ) from error
+    try:
+        return Path(
+            snapshot_download(hub_id, revision=revision, allow_patterns=[WEIGHTS_FILE, CONFIG_FILE, "README.md"])
+        )
+    except Exception as error:  # no network, no such id, no right to it: each has errors of its own
+        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise InputError(
+            hub_id, f"no such path, nor fetched from the hub ({first})", "give a path, or an id"
+        ) from error
 
 
 def _placed(model: NetworkModel) -> NetworkModel:
@@ -85,7 +138,7 @@ def read_card(path: Path | str) -> dict[str, Any]:
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
     try:
         with safe_open(str(path), framework="pt") as file:
-            metadata = file.metadata() or {}
+            metadata = _described(path, file.metadata() or {})
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
         config, card = json.loads(metadata["network"]), json.loads(metadata["card"])
     except (SafetensorError, OSError, ValueError) as error:
@@ -97,6 +150,15 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], NetworkConfig, dic
     if not isinstance(config, dict) or not isinstance(card, dict):
         raise InputError(path, "metadata is not two JSON objects", "expected one exported by `lightdepth train`")
     return weights, NetworkConfig.from_dict(config), card
+
+
+def _described(path: Path, metadata: dict[str, str]) -> dict[str, str]:
+    """A file's own metadata, or what config.json beside it has."""
+    beside = path.with_name(CONFIG_FILE)
+    if {"network", "card"} <= metadata.keys() or path.name != WEIGHTS_FILE or not beside.is_file():
+        return metadata
+    found = read_json(beside)
+    return {name: json.dumps(found[name]) for name in ("network", "card") if name in found}
 
 
 def _load_safetensors(path: Path, name: str, details: bool) -> NetworkModel:

@@ -69,6 +69,7 @@ def test_help_lists_the_verbs_in_the_order_of_the_work_each_with_its_line(capsys
         "evaluate",
         "bench",
         "measure",
+        "export",
     ]
     assert all(len(line.split()) > 4 for line in lines if line.startswith("  "))
     assert lightdepth() == 2

@@ -21,7 +21,13 @@ from lightdepth.tube.export import write_synthetic
 README = (Path(__file__).parent.parent / "README.md").read_text()
 BLOCKS = re.split(r"^```.*$", README, flags=re.MULTILINE)[1::2]
 COMMANDS = [line for block in BLOCKS for line in block.splitlines() if line.startswith("lightdepth ")]
-MINUTES = ("bench", "ablate", "train --preset lightdepth", "train --preset tube_smoke -o runs/real")
+MINUTES = (
+    "bench",
+    "ablate",
+    "train --preset lightdepth",
+    "train --preset tube_smoke -o runs/real",
+    "export lightdepth-self -o runs/onnx",
+)
 """Commands that take minutes: what they do is tested in modules of their own."""
 OTHER_DATA = ("--suite", "calib_results.txt", "--join", "joined_000", "lightdepth select", "--data.frames")
 """Commands on data that the colon does not give (its small frames do not match); likewise."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from densify.evaluation.depth_files import DepthReading
 from densify.evaluation.judge import judge_gap
 from densify.evaluation.judged_map import read_run
 from densify.evaluation.records import Sources
@@ -23,13 +24,14 @@ def evaluate(
     checkpoint: str | None = None,
     trajectory: Path | None = None,
     judging: Group[JudgingConfig] = JudgingConfig(),
+    reading: Group[DepthReading] = DepthReading(),
     overwrite: bool = False,
 ) -> None:
     """Errors of predictions, a densify run, a map or a trajectory, against truth and between submaps.
 
     Args:
-        run: Folder made by densify or predict, one of its map folders (joined_000), a sparse map, or a trajectory
-            (TUM).
+        run: Folder made by densify or predict, one of its map folders (joined_000), a sparse map, a trajectory (TUM),
+            or with --depth-kind any program's folder of depth.
         output: Folder for the metrics; left out, evaluation/ in the run.
         join: JSON file with the Sim(3) that takes one submap to another (first, second, scale, rotation, translation),
             by which the gap between their surfaces is judged.
@@ -45,6 +47,7 @@ def evaluate(
     arguments = recorded(
         source,
         judging,
+        reading,
         run=run,
         output=output,
         join=join,
@@ -52,7 +55,7 @@ def evaluate(
         checkpoint=checkpoint,
         trajectory=trajectory,
     )
-    asked = read_asked(run, source, judging, join, suite, trajectory, in_place=output is None)
+    asked = read_asked(run, source, judging, join, suite, trajectory, output is None, reading)
     model = None if checkpoint is None else load_model(checkpoint, details=False)
     gap = None if join is None else judge_gap(read_run(run), join)
     with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite or output is None) as out:

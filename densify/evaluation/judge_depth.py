@@ -9,35 +9,40 @@ from pathlib import Path
 
 import numpy as np
 
+from densify.evaluation.depth_files import DepthReading
 from densify.evaluation.errors import compare_depth, true_depth
 from densify.evaluation.records import EDGES_MM, DepthFigures, DepthJudged, Evaluation
 from densify.evaluation.truth import shared_frames
 from lightdepth.datasets import FrameSequence
-from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
-from lightdepth.prediction import read_prediction
 
 
 def judge_depth(
-    folder: Path, truth: FrameSequence, max_depth_mm: float = 100.0, common: bool = False
+    folder: Path,
+    truth: FrameSequence,
+    max_depth_mm: float = 100.0,
+    common: bool = False,
+    reading: DepthReading = DepthReading(),
 ) -> Evaluation[DepthJudged]:
-    """Depth errors of a predictions folder: per frame and their mean, under every alignment.
+    """Depth errors of a predictions folder: per frame and their mean, under every alignment. `reading` says what its
+    files are, where another program made them.
 
     Predictions of frames that the truth has not are refused, with the frames that match, unless only the `common` ones
     are wanted. Frames without true depth are skipped, and named.
     """
     from lightdepth.metrics import ALIGNMENTS  # brings torchmetrics, which takes seconds to import
 
-    files = numbered_files(folder, r".*?(\d+)\D*\.npz")
+    files = reading.files(folder)
     numbers = shared_frames(files, truth.numbers, "predictions", truth.source, common)
     rows: dict[str, DepthFigures] = {}
     skipped: dict[str, str] = {}
     within: dict[str, list[np.ndarray]] = {name: [] for name in ALIGNMENTS}
     units = set()
     for number in numbers:
-        prediction, frame = read_prediction(files[number]), truth.by_number(number)
+        frame = truth.by_number(number)
         assert frame is not None
+        prediction = reading.read(files[number], frame.camera)
         reason = _no_depth(frame, max_depth_mm)
         if reason:
             skipped[prediction.name] = reason

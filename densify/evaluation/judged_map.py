@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.dense_map import DenseMapFiles, map_folders, read_dense_map, run_record
+from densify.evaluation.depth_files import other_depth
 from densify.evaluation.trajectory import (
     Trajectory,
     in_order,
@@ -86,7 +87,7 @@ def read_models(path: Path, trajectory: Path | None = None, reader: Reader = Rea
                 path,
                 "neither map_* folders (a densify run) nor .npz files (predictions) nor a trajectory, and no map: "
                 f"{error.found}",
-                error.cure,
+                error.cure + ("; if it is another program's depth, say --depth-kind" if other_depth(path) else ""),
             ) from error
         trajectory = trajectory or (path if trajectory_files(path) else None)
     return models if trajectory is None else with_trajectories(models, read_trajectories(trajectory, reader))

@@ -155,4 +155,10 @@ PAGES = {
             "lightdepth measure runs/dense --frame 120 --pixels '[[310, 200], [420, 260]]'",
         )
     ),
+    "export": Page(
+        (
+            "lightdepth export runs/dense -o runs/colmap --to colmap",
+            "lightdepth export runs/mine/model.safetensors -o runs/onnx --to onnx",
+        )
+    ),
 }

@@ -203,10 +203,16 @@ def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
 # ---- writing
 
 
-def write_text_model(submap: Submap, folder: Path, images: Mapping[str, np.ndarray] | None = None) -> None:
+def write_text_model(
+    submap: Submap,
+    folder: Path,
+    images: Mapping[str, np.ndarray] | None = None,
+    colors: np.ndarray | None = None,
+) -> None:
     """A submap as a COLMAP text model with proper tracks, exact to the last bit; `folder` is made.
 
-    `images` by keyframe name, (H, W, 3) RGB in [0, 1], give the points their colour; without them points are grey.
+    `images` by keyframe name, (H, W, 3) RGB in [0, 1], give the points their colour, or `colors` (n, 3) uint8 do;
+    without them points are grey.
     SCARAMUZZA is written under its own name, which `read_map` reads and COLMAP does not know.
     """
     folder, submap = Path(folder), at_its_place(submap)
@@ -219,7 +225,8 @@ def write_text_model(submap: Submap, folder: Path, images: Mapping[str, np.ndarr
     (folder / "cameras.txt").write_text("\n".join(camera_lines) + "\n")
 
     row = {int(i): r for r, i in enumerate(submap.point_ids.tolist())}
-    errors, colors = _looks(submap, row, images or {})
+    errors, looks = _looks(submap, row, images or {})
+    colors = looks if colors is None else colors
     tracks: list[list[tuple[int, int]]] = [[] for _ in row]
     image_lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# X Y POINT3D_ID ..."]
     for image_id, keyframe in enumerate(submap.keyframes, 1):

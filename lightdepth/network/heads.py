@@ -20,6 +20,8 @@ Uncertainty: the standard deviation of log t, once each frame's scale is taken o
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -30,6 +32,9 @@ CHANNELS = {"rgb": 3, "closed_form": 1, "ray_z": 1, "mask": 1, "reflectance": 1}
 """Inputs to choose from, and how many channels each takes; reflectance is the wall's, as the calibration has it."""
 
 OUTPUTS = ("residual", "absolute", "free")
+
+ClosedForm = Callable[[Tensor, Tensor, Tensor, LightTerms, float], Tensor]
+"""Log distance of image, mask, rays and light, and the width of the blur."""
 
 _LOG_LIMIT = 15.0  # only to keep exp, and its square, finite
 _LOG_SIGMA_LIMIT = 6.0
@@ -46,13 +51,19 @@ def mean_per_image(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def network_inputs(
-    image: Tensor, mask: Tensor, rays: Tensor, light: LightTerms, names: tuple[str, ...], blur: float
+    image: Tensor,
+    mask: Tensor,
+    rays: Tensor,
+    light: LightTerms,
+    names: tuple[str, ...],
+    blur: float,
+    closed_form: ClosedForm = log_closed_form,
 ) -> tuple[Tensor, Tensor]:
     """The input channels (B, C, H, W) and the log closed form c (B, 1, H, W), which outside the mask is its mean.
 
     `blur` of the closed form as a share of the image height.
     """
-    log_closed = log_closed_form(image, mask, rays, light, blur)
+    log_closed = closed_form(image, mask, rays, light, blur)
     mean = mean_per_image(log_closed, mask)
     log_closed = torch.where(mask, log_closed, mean)
     made = {

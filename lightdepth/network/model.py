@@ -10,12 +10,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lightdepth.decline import log_closed_form
 from lightdepth.errors import InputError
 from lightdepth.network import dpt, unet
 from lightdepth.network.dpt import DPT
 from lightdepth.network.heads import (
     CHANNELS,
     OUTPUTS,
+    ClosedForm,
     UncertaintyHead,
     input_channels,
     network_inputs,
@@ -137,22 +139,32 @@ class DepthNetwork(nn.Module):
         """Distance and albedo of `estimate`."""
         return self.estimate(image, mask, rays, light)[:2]
 
-    def estimate(self, image: Tensor, mask: Tensor, rays: Tensor, light: LightTerms) -> Estimate:
-        """image (B, 3, H, W) encoded RGB; mask (B, 1, H, W) bool; rays (B, 3, H, W) unit; light terms (B, 1, 1, 1)."""
+    def estimate(
+        self,
+        image: Tensor,
+        mask: Tensor,
+        rays: Tensor,
+        light: LightTerms,
+        closed_form: ClosedForm = log_closed_form,
+    ) -> Estimate:
+        """image (B, 3, H, W) encoded RGB; mask (B, 1, H, W) bool; rays (B, 3, H, W) unit; light terms (B, 1, 1, 1).
+        `closed_form` is there for graphs of any image size, which need it in other operations."""
         height, width = image.shape[-2:]
         with full_precision(image.device):
-            inputs, log_closed = network_inputs(image, mask, rays, light, self.config.inputs, self.config.blur)
+            inputs, log_closed = network_inputs(
+                image, mask, rays, light, self.config.inputs, self.config.blur, closed_form
+            )
         multiple = self.body.multiple
         padded = F.pad(inputs, (0, -width % multiple, 0, -height % multiple), mode="replicate")
         features = self.body(padded)
         coarse = self.body.head(features)
-        raw = _resized(coarse, padded)[..., :height, :width]
+        raw = _cropped(_resized(coarse, padded), height, width)
         with full_precision(image.device):
             distance, albedo_hs = network_outputs(raw, log_closed, mask, self.config.output)
         log_sigma = None
         if self.uncertainty is not None:
             seen = torch.cat([_resized(x, features) for x in (features, padded, coarse[:, :1])], 1)
-            log_sigma = _resized(self.uncertainty(seen), padded)[..., :height, :width]
+            log_sigma = _cropped(_resized(self.uncertainty(seen), padded), height, width)
         return Estimate(distance, albedo_hs, log_sigma)
 
 
@@ -170,4 +182,15 @@ def build_network(config: NetworkConfig) -> DepthNetwork:
 def _resized(values: Tensor, like: Tensor) -> Tensor:
     """Bilinear, to the height and width of `like`."""
     size = like.shape[-2:]
-    return values if values.shape[-2:] == size else F.interpolate(values, size=size, mode="bilinear")
+    if not torch.compiler.is_compiling() and values.shape[-2:] == size:  # a graph of any size asks no sizes
+        return values
+    return F.interpolate(values, size=size, mode="bilinear")
+
+
+def _cropped(values: Tensor, height: int, width: int) -> Tensor:
+    """The first rows and columns."""
+    if not torch.compiler.is_compiling():
+        return values[..., :height, :width]
+    # In a graph of any size a view would ask whether it is the whole; a copy does not.
+    rows, columns = (torch.arange(n, device=values.device) for n in (height, width))
+    return values.index_select(-2, rows).index_select(-1, columns)

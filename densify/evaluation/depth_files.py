@@ -1,0 +1,165 @@
+"""Depth that any other program predicted, as the files that such programs write: .npz, .npy, TIFF, 16-bit PNG.
+
+A file holds one array (H, W), of one of three kinds, s the scale that the user gives:
+
+    distance    along the ray          t = s v
+    depth       along the axis         z = s v
+    disparity   one over depth         z = s / v
+
+A pixel is valid where v is finite and above 0 (and where an array `valid` of a .npz says so). Arrays smaller or larger
+than the frame, of the same aspect, are brought to its size as our own models' are: log distance is interpolated.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from lightdepth.camera import CameraModel
+from lightdepth.datasets.sequence import numbered_files
+from lightdepth.errors import InputError
+from lightdepth.files.images import read_raw
+from lightdepth.geometry import distance_from_depth
+from lightdepth.prediction import DepthPrediction, read_prediction
+
+DepthKind = Literal["distance", "depth", "disparity"]
+SUFFIXES = ("npz", "npy", "tiff", "tif", "png")
+"""Endings that are read, the first that a folder has: a picture often lies beside the numbers."""
+_NAMES = ("distance", "depth", "disparity", "disp", "pred", "prediction", "arr_0")
+_UNREADABLE = (OSError, EOFError, ValueError, TypeError, zipfile.BadZipFile, zlib.error)
+_LEAST_RAY_Z = 0.05  # as of true depth: farther to the side, depth along the axis says nothing
+
+
+@dataclass(frozen=True)
+class DepthReading:
+    """How a folder of depth is read. Without a kind it is one that `lightdepth predict` made."""
+
+    depth_kind: DepthKind | None = None
+    """What the numbers of another program's depth files are (.npy, .npz, TIFF, 16-bit PNG): distance along the ray,
+    depth along the axis, or disparity, which is one over depth. Left out, the folder is one of `lightdepth predict`."""
+    depth_scale: float | None = None
+    """Factor from the numbers in another program's depth files to mm (of disparity: depth is the factor over it). Left
+    out, they are up to scale. A larger one makes a farther wall."""
+
+    def __post_init__(self) -> None:
+        if self.depth_scale is not None and not (np.isfinite(self.depth_scale) and self.depth_scale > 0):
+            raise InputError("--depth-scale", f"{self.depth_scale}", "expected a positive factor")
+        if self.depth_scale is not None and self.depth_kind is None:
+            raise InputError(
+                "--depth-scale", "given without --depth-kind", "say what is scaled: distance, depth or disparity"
+            )
+
+    def files(self, folder: Path) -> dict[int, Path]:
+        """The depth files of a folder, by the number in their names. Raises InputError where there is none."""
+        for suffix in SUFFIXES if self.depth_kind else SUFFIXES[:1]:
+            found = numbered_files(folder, rf".*?(\d+)\D*\.{suffix}")
+            if found:
+                return found
+        if self.depth_kind is None:
+            return {}
+        raise InputError(
+            folder,
+            "no depth files with a number in their names",
+            f"expected one for each frame, such as 000012.npy, ending in {', '.join(SUFFIXES)}",
+        )
+
+    def read(self, path: Path, camera: CameraModel) -> DepthPrediction:
+        """What a file says of a frame of this camera. Raises InputError where it does not hold what is expected."""
+        if self.depth_kind is None:
+            try:
+                return read_prediction(path)
+            except InputError as error:
+                cure = f"{error.cure}; of another program's depth say --depth-kind distance, depth or disparity"
+                raise InputError(error.where, error.found, cure) from error
+        values, valid = _array(path)
+        valid &= np.isfinite(values) & (values > 0)
+        if not valid.any():
+            raise InputError(path, "no finite number above 0 in it", "leave it out, or is it of another kind?")
+        values = np.where(valid, values, 1)
+        scale = self.depth_scale or 1.0
+        metric = (scale / values if self.depth_kind == "disparity" else scale * values).astype(np.float32)
+        metric, valid = _resized(metric, valid, camera, path)
+        if self.depth_kind != "distance":
+            ray_z = camera.rays()[0][..., 2]
+            valid &= ray_z > _LEAST_RAY_Z
+            metric = distance_from_depth(metric, np.where(valid, ray_z, 1)).astype(np.float32)
+        unit = "up to scale" if self.depth_scale is None else "mm"
+        return DepthPrediction(path.stem, metric, valid, camera, f"{self.depth_kind} in {path.suffix} files", unit)
+
+
+def other_depth(path: Path) -> bool:
+    """Whether a folder may be another program's depth, which is read where its kind is said."""
+    return path.is_dir() and any(numbered_files(path, rf".*?(\d+)\D*\.{suffix}") for suffix in SUFFIXES)
+
+
+def _array(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers (H, W) of a file, and which of them it calls valid."""
+    if path.suffix == ".npz":
+        values, valid = _chosen(_load_npz(path), path)
+    else:
+        values, valid = (_load_npy(path) if path.suffix == ".npy" else read_raw(path)), None
+    shape = values.shape
+    if values.ndim != 2:
+        values = values.squeeze()
+    if values.ndim != 2 or values.dtype.kind not in "fui":
+        raise InputError(path, f"{values.dtype} of shape {shape}", "expected one number a pixel, (H, W)")
+    if values.dtype == np.uint8:
+        raise InputError(
+            path, "8 bits a pixel, a picture of depth and not depth", "expected 16-bit PNG, TIFF, .npy or .npz"
+        )
+    return values.astype(np.float64), np.ones(values.shape, bool) if valid is None else valid.copy()
+
+
+def _load_npy(path: Path) -> np.ndarray:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except _UNREADABLE as error:
+        raise InputError(path, f"not an array ({error})", "expected numbers as numpy.save writes them") from error
+
+
+def _load_npz(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return {name: data[name] for name in data.files}
+    except _UNREADABLE as error:
+        raise InputError(path, f"not arrays ({error})", "expected an .npz as numpy.savez writes it") from error
+
+
+def _chosen(arrays: Mapping[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """The depth of an .npz, by its name, or the only array of numbers; and `valid`, where that is there."""
+    numbers = {name: a for name, a in arrays.items() if a.dtype.kind in "fui" and a.squeeze().ndim == 2}
+    named = [name for name in _NAMES if name in numbers] or (list(numbers) if len(numbers) == 1 else [])
+    if not named:
+        raise InputError(
+            path,
+            f"arrays {', '.join(arrays) or 'none'}: none is known as depth",
+            f"expected one array (H, W), or one with the name {', '.join(_NAMES[:4])}",
+        )
+    valid = arrays.get("valid")
+    fits = valid is not None and valid.dtype == bool and valid.shape == numbers[named[0]].shape
+    return numbers[named[0]], valid if fits else None
+
+
+def _resized(metric: np.ndarray, valid: np.ndarray, camera: CameraModel, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """At the size of the camera; valid where all pixels that are merged are."""
+    height, width = metric.shape
+    size = (camera.width, camera.height)
+    if (width, height) == size:
+        return metric, valid
+    if abs(width * camera.height / (height * camera.width) - 1) > 0.01:
+        raise InputError(
+            path,
+            f"depth is {width}x{height}, the frame {camera.width}x{camera.height}",
+            "expected the same size, or one of the same aspect",
+        )
+    method = cv2.INTER_AREA if camera.width < width else cv2.INTER_LINEAR
+    share = cv2.resize(valid.astype(np.float32), size, interpolation=method)
+    log = cv2.resize(np.where(valid, np.log(metric), 0).astype(np.float32), size, interpolation=method)
+    return np.exp(log), share > 0.999

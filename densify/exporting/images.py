@@ -1,0 +1,51 @@
+"""The pictures that go with an exported map: as they are, or as a pinhole camera would have taken them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lightdepth.camera import CameraModel, Pinhole
+from lightdepth.camera_conversion import convert_camera
+from lightdepth.errors import InputError
+from lightdepth.files.images import to_bgr8
+
+
+def known_camera(camera: CameraModel, names: tuple[str, ...], instead: str) -> tuple[CameraModel, str]:
+    """The camera itself where a program knows its model, else the nearest one of `instead`, and what to say of it."""
+    if camera.name in names:
+        return camera, ""
+    found = convert_camera(camera, instead)
+    said = (
+        f"{instead} in place of {camera.name}: off by {found.median_px:.2g} px (median), {found.max_px:.2g} px "
+        f"(largest), over {found.seen_share:.1%} of the field"
+    )
+    return found.camera, said
+
+
+def pinhole_of(camera: CameraModel) -> Pinhole:
+    """A pinhole camera of the same size and focal length; a pinhole's own."""
+    if isinstance(camera, Pinhole):
+        return camera
+    f = camera.focal_length
+    return Pinhole(camera.width, camera.height, f, f, camera.width / 2, camera.height / 2)
+
+
+def seen_by(image: np.ndarray, camera: CameraModel, other: CameraModel) -> np.ndarray:
+    """(H, W, 3) of `camera` as `other` would have taken it from the same place; black outside the first one's field."""
+    if camera == other:
+        return image
+    rays, valid = other.rays()
+    pixels, seen = camera.project(rays)
+    at = (pixels - 0.5).astype(np.float32)
+    moved = cv2.remap(image.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    return np.where((valid & seen)[..., None], moved, 0)
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """(H, W, 3) RGB in [0, 1] as an 8-bit PNG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), to_bgr8(image)):
+        raise InputError(path, "cannot be written", "choose another place")

@@ -1,0 +1,101 @@
+"""What the verb export makes of dense maps, into its run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from densify.dense_map import map_folders, run_record
+from densify.exporting.colmap import write_colmap
+from densify.exporting.exported import Exportable, read_exportables
+from densify.exporting.meshes import write_mesh, write_surfaces
+from densify.exporting.nerfstudio import write_nerfstudio
+from densify.exporting.trees import write_climb, write_trajectory
+from lightdepth.calibration import read_camera
+from lightdepth.datasets import FORMATS, FrameSequence, open_sequence
+from lightdepth.errors import InputError
+from lightdepth.reporting.run import Run
+
+MAP_KINDS = Literal["colmap", "nerfstudio", "ply", "glb", "obj", "tum", "climb"]
+
+
+@dataclass(frozen=True)
+class MapExport:
+    """What goes with the maps of a densify run."""
+
+    data: Path | None = None
+    """Frames of the run, for pictures, masks and times; left out, those that the run names, where they still are."""
+    map: Path | None = None
+    """Sparse map that the run was made of, for tracks; left out, the one that the run names, where it still is."""
+    points: int = 100_000
+    """Number of the surface's vertices at most that stand among the points of colmap, nerfstudio and climb, besides
+    the map's own. More show the surface more finely and make larger files."""
+    frame_offset: int = 1
+    """Number added to each frame's for climb, which counts frames from 1. More shift the frames later."""
+
+
+def export_maps(run: Run, source: Path, to: str, options: MapExport) -> None:
+    """Every dense map of a run, each into a folder of its name."""
+    if options.points < 0:
+        raise InputError("--points", f"{options.points}", "expected a number of points, or 0 for none")
+    maps = read_exportables(source, options.map)
+    frames = _frames(run, source, options.data) if to in ("colmap", "nerfstudio", "tum", "climb") else None
+    times = _times(frames, maps) if to in ("tum", "climb") else {}
+    run.record["unit"] = maps[0].unit
+    if to == "climb":
+        single = [m for m in maps if m.name.startswith("map_")] or maps
+        seconds = run_record(source).get("seconds")
+        work = float(seconds) if isinstance(seconds, (int, float)) else 0.0
+        write_climb(single, run.folder, times, options.frame_offset, options.points, (0.0, work))
+        run.log(f"{len(single)} maps, frames counted from {options.frame_offset}, in {single[0].unit}")
+        return
+    for exported in maps:
+        folder = run.folder / exported.name
+        folder.mkdir()
+        said: list[str] = []
+        if to == "colmap":
+            said = write_colmap(exported, folder, frames, options.points)
+            if not exported.tracked:
+                run.warn(f"{exported.name}: the map's points have no tracks: --map MAP, which the run was made of")
+        elif to == "nerfstudio":
+            said = write_nerfstudio(exported, folder, frames, options.points)
+        elif to == "ply":
+            write_surfaces(exported, folder)
+        elif to == "tum":
+            write_trajectory(exported, folder / "trajectory.tum", times)
+        else:
+            write_mesh(exported, folder / f"mesh.{to}")
+        for words in said:
+            run.warn(f"{exported.name}: {words}")
+        run.log(f"{exported.name}: {len(exported.submap.keyframes)} keyframes, {len(exported.dense.vertices)} vertices")
+
+
+def _frames(run: Run, source: Path, given: Path | None) -> FrameSequence | None:
+    """The frames that a run was made of: those given, or those that it names, where they are still there."""
+    arguments = run_record(source).get("arguments")
+    named = arguments if isinstance(arguments, Mapping) else {}
+    folder = map_folders(source)[0].parent
+    beside = folder / "data" if (folder / "data").is_dir() else None  # where `demo` has them
+    path = given or (Path(str(named["data"])) if named.get("data") else beside)
+    if path is None or not path.exists():
+        run.warn(
+            f"the run's frames are not found{f' ({path})' if path else ''}: no pictures, times or masks; give --data"
+        )
+        return None
+    own = {key: Path(str(named[key])) for key in ("camera", "mask") if named.get(key)}
+    own = {key: file for key, file in own.items() if file.exists()}
+    known = next((name for name in FORMATS if name == named.get("format")), None)
+    camera = None if "camera" in own else read_camera(map_folders(source)[0] / "camera.json")
+    return open_sequence(path, known, own.get("camera"), None, own.get("mask"), camera)
+
+
+def _times(frames: FrameSequence | None, maps: list[Exportable]) -> dict[int, float]:
+    """Seconds of keyframes by frame number, where the frames have them."""
+    found = {}
+    for number in sorted({k.number for m in maps for k in m.submap.keyframes}) if frames is not None else ():
+        frame = frames.by_number(number) if frames is not None else None
+        if frame is not None and frame.time is not None:
+            found[number] = frame.time
+    return found

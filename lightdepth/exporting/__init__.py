@@ -1,0 +1,1 @@
+"""What leaves this program for others: checkpoints as graphs and as folders for a hub, depth as pictures."""
