@@ -21,6 +21,7 @@ def sparse(
     format: FormatName | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
+    bit_depth: int | None = None,
     poses: str | None = None,
     repair: Path | None = None,
     sfm: SfmConfig = SfmConfig(),
@@ -35,6 +36,8 @@ def sparse(
             looking if left out.
         camera: Calibration file that wins over the folder's own.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
+        bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
+            their highest values show. A larger one reads the same numbers as darker.
         poses: Known poses, at which points are only triangulated: truth, those of the sequence, or a TUM file (world
             from camera) whose times are frame numbers.
         repair: Sparse map of the frames to make anew from its keyframes' images, beginning at its poses, in its frame
@@ -44,9 +47,17 @@ def sparse(
     """
     if repair is not None and poses is not None:
         raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
-    source = SequenceSource(data, format, camera, mask=mask)
+    source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth)
     arguments = recorded(
-        output=output, data=data, format=format, camera=camera, mask=mask, poses=poses, repair=repair, sfm=sfm
+        output=output,
+        data=data,
+        format=format,
+        camera=camera,
+        mask=mask,
+        bit_depth=bit_depth,
+        poses=poses,
+        repair=repair,
+        sfm=sfm,
     )
     with run_folder(output, "sparse", arguments, overwrite) as run:
         run.hash_inputs(data=data, repair=repair)

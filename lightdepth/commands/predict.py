@@ -41,6 +41,7 @@ def predict(
         run.hash_inputs(data=source.data)
         if previews:
             (run.folder / "previews").mkdir()
+        nothing = 0
         for i in range(len(frames)):
             try:
                 frame = frames[i]
@@ -48,6 +49,7 @@ def predict(
                 run.fail(frames.names[i], str(error))
                 continue
             prediction = model(frame)
+            nothing += not prediction.valid.any()
             prediction.save(run.folder / f"{frame.name}.npz")
             if previews:
                 colors = colored_distance(prediction.distance, prediction.valid)
@@ -56,4 +58,6 @@ def predict(
             bar.advance()
         if len(run.record["failures"]) == len(frames):
             raise InputError(source.data, "no frame could be read", f"the first: {run.record['failures'][0]['reason']}")
+        if nothing:
+            run.warn(f"{nothing} of {len(frames)} frames have no valid pixel: they are black, or masked")
         run.record["checkpoint"] = model.name

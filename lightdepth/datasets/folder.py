@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
@@ -25,7 +24,7 @@ from lightdepth.datasets.sequence import (
     read_mask,
 )
 from lightdepth.errors import InputError
-from lightdepth.files.images import image_size, read_raw, to_bgr8
+from lightdepth.files.images import image_size, read_raw, to_bgr8, write_image
 from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
@@ -41,11 +40,13 @@ def read_folder(
     camera: CameraModel | None = None,
     light: PhotometricCalibration | None = None,
     mask: np.ndarray | None = None,
+    *,
+    bit_depth: int | None = None,
 ) -> FrameSequence:
     """Frames of a folder. What is given here wins over the files in it; without any camera it is refused."""
     images = list_images(image_folder(path))
     if not images:
-        raise InputError(path, f"{no_images(path)}", "expected frames such as 000123.png")
+        raise InputError(image_folder(path), no_images(image_folder(path)), "expected frames such as 000123.png")
     known = {frame_number(file.name) for file in (path / "truth" / "distance").glob("*.tiff")}
     checked_images(path, images, known)
     first = legible(images)
@@ -89,6 +90,7 @@ def read_folder(
         times=[clock.get(image.stem, time) for image, time in zip(images, of_truth, strict=True)],
         poses=poses,
         distance=distance,
+        bit_depth=bit_depth,
     )
 
 
@@ -111,10 +113,10 @@ def write_folder(frames: Iterable[Frame], path: Path) -> None:
     poses, times, first = [], [], None
     for frame in frames:
         first = first or frame
-        cv2.imwrite(str(path / "frames" / f"{frame.name}.png"), to_bgr8(frame.image))
+        write_image(path / "frames" / f"{frame.name}.png", to_bgr8(frame.image))
         if frame.true_distance is not None:
             (path / "truth" / "distance").mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(path / "truth" / "distance" / f"{frame.name}.tiff"), frame.true_distance.astype(np.float32))
+            write_image(path / "truth" / "distance" / f"{frame.name}.tiff", frame.true_distance.astype(np.float32))
         if frame.true_world_from_cam is not None:
             poses.append(frame.true_world_from_cam)
             times.append(frame.time or 0.0)
@@ -123,7 +125,7 @@ def write_folder(frames: Iterable[Frame], path: Path) -> None:
     write_camera(first.camera, path / "camera.json")
     write_light(first.light, path / "light.json")
     if first.mask is not None:
-        cv2.imwrite(str(path / "mask.png"), first.mask.astype(np.uint8) * 255)
+        write_image(path / "mask.png", first.mask.astype(np.uint8) * 255)
     if poses:
         write_tum(path / "truth" / "poses.tum", times, poses)
 

@@ -52,6 +52,9 @@ class SelectConfig:
     """weights and thresholds of the loftr matcher"""
     loftr_nodes: NodeRules = LOFTR_NODES
     """what is covisible and what is kept, with the loftr matcher"""
+    bit_depth: int | None = None
+    """Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what their
+    highest values show. A larger one reads the same numbers as darker."""
     map_rules: MapRules = field(default_factory=MapRules)
     """what is kept, with --map"""
 
@@ -87,7 +90,7 @@ def select(
     paths = _paths(output, no_frames, overwrite)
     sparse_map = read_map(map) if map is not None else None
     map_camera = sparse_map.submaps[0].keyframes[0].camera if sparse_map is not None else None
-    frames = SequenceSource(data, format, camera, mask=mask).open(map_camera)
+    frames = SequenceSource(data, format, camera, mask=mask, bit_depth=config.bit_depth).open(map_camera)
     settings: dict[str, object]
     if sparse_map is not None and map is not None:
         verdicts, how = _by_map(frames, sparse_map, map, config.map_rules)
