@@ -47,7 +47,6 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
     frames = readable(sequence, sequence.sampled)
     if not frames:
         return sequence
-    check_shown(sequence, frames)
     for message in (
         *_camera_doubts(frames[0].camera),
         *_light_doubts(frames[0].light),
@@ -58,6 +57,7 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
         *_comb_doubts(frames),
     ):
         warnings.warn(f"{sequence.source}: {message}", stacklevel=3)
+    check_shown(sequence, frames)
     for frame in frames:
         if frame.true_world_from_cam is not None:
             check_rigid(frame.true_world_from_cam, f"{sequence.source}: {frame.name}")
