@@ -189,7 +189,7 @@ def time_spent(played: Sequence[Played], budget: float) -> TimeSpent:
 
 def write_timings(played: Sequence[Played], path: Path) -> None:
     """A table with a row for each keyframe; times in milliseconds, `cpu_…` of all threads together."""
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
         table = csv.writer(file)
         steps = [f"{kind}{step}_ms" for kind in ("", "cpu_") for step in (*ALL_STEPS, "total")]
         table.writerow(

@@ -35,7 +35,7 @@ def _kept(file: str, gone: Mapping[str, str]) -> str:
     import yaml
 
     try:
-        settings = yaml.safe_load(Path(file).read_text())
+        settings = yaml.safe_load(Path(file).read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, yaml.YAMLError):
         return file  # the parser says what is wrong with it
     found = {key: why for key, why in gone.items() if _dropped(settings, key.split("."))}

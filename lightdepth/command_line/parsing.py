@@ -19,7 +19,14 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
 import yaml
-from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
+from jsonargparse import (
+    ArgumentParser,
+    DefaultHelpFormatter,
+    Namespace,
+    get_loader,
+    set_loader,
+    set_parsing_settings,
+)
 
 from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, literals, placeholder
 from lightdepth.command_line.pages import Page
@@ -61,11 +68,20 @@ class Formatter(DefaultHelpFormatter):
         return placeholder(kinds[0]) if kinds else action.dest.upper()
 
 
+_of_yaml = get_loader("yaml")
+
+
+def _loaded(text: str) -> Any:
+    """What a word of the command line, or a file, means as YAML; the name of a file that is not UTF-8 means itself."""
+    return text if any("\udc80" <= letter <= "\udcff" for letter in text) else _of_yaml(text)
+
+
 class Parser(ArgumentParser):
     """The options of one verb."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         set_parsing_settings(docstring_parse_attribute_docstrings=True)
+        set_loader("yaml", _loaded, exceptions=(yaml.YAMLError,))
         super().__init__(*arguments, **{"formatter_class": Formatter, **settings})
         self.page = Page()
 
@@ -326,7 +342,7 @@ def _check_config(parser: Parser, file: Path) -> None:
     more = f"Read on: {parser.prog} --help"
     if not _is_yaml(file):
         fail(parser, f"{file}: not YAML: expected a line `option: value` for each setting. {more}")
-    found = yaml.safe_load(file.read_text())
+    found = yaml.safe_load(file.read_text(encoding="utf-8-sig"))
     if not isinstance(found, Mapping):
         fail(parser, f"{file}: no settings in it; expected a line `option: value` for each. {more}")
     below = {action.dest.partition(".")[0]: action.dest for action in options(parser) if "." in action.dest}
@@ -337,7 +353,7 @@ def _check_config(parser: Parser, file: Path) -> None:
 
 def _is_yaml(path: Path) -> bool:
     try:
-        yaml.safe_load(path.read_text())
+        yaml.safe_load(path.read_text(encoding="utf-8-sig"))
     except (yaml.YAMLError, UnicodeDecodeError):
         return False
     return True
@@ -347,7 +363,7 @@ def _file_with(argv: Sequence[str], key: str) -> str:
     """`FILE: ` for the last file of settings on the command line that has the key, else nothing."""
     result = ""
     for path in _config_files(argv):
-        node: Any = yaml.safe_load(path.read_text()) if _is_yaml(path) else None
+        node: Any = yaml.safe_load(path.read_text(encoding="utf-8-sig")) if _is_yaml(path) else None
         for part in key.split("."):
             node = node.get(part, _ABSENT) if isinstance(node, Mapping) else _ABSENT
         result = f"{path}: " if node is not _ABSENT else result

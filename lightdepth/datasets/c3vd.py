@@ -167,7 +167,7 @@ def write_c3vd(frames: Sequence[Frame], path: Path, tree: str = "v1") -> None:
         if frame.true_world_from_cam is not None:
             lines.append(",".join(f"{v:.9g}" for v in frame.true_world_from_cam.T.ravel()))
     if lines:
-        (path / "pose.txt").write_text("\n".join(lines) + "\n")
+        (path / "pose.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _tree(path: Path) -> _Tree | None:
@@ -184,7 +184,7 @@ def _colour(path: Path, tree: _Tree) -> dict[int, Path]:
 def _read_poses(path: Path) -> np.ndarray:
     """(n, 4, 4) world_from_cam [mm], whichever way the lines were flattened."""
     try:
-        rows = np.loadtxt(path, delimiter=",", ndmin=2)
+        rows = np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(
             path, f"not a C3VD pose file ({error})", "expected 16 numbers a line separated by commas"

@@ -146,7 +146,7 @@ def _in_cluster(path: Path, images: list[Path]) -> tuple[list[Path], CameraModel
     model = cluster[0] / "sparse" / path.stem
     keyframes = read_map(model).submaps[0].keyframes if model.is_dir() else ()
     if path.suffix == ".txt":
-        names = path.read_text(errors="replace").split()
+        names = path.read_text(errors="replace", encoding="utf-8-sig").split()
         odd = [name for name in names if not re.fullmatch(r"(?:.*[/\\])?out\d+(?:\.\w+)?", name)]
         if odd or not names:
             raise InputError(

@@ -123,17 +123,18 @@ def write_endoslam(frames: Sequence[Frame], path: Path, simulated: bool = False)
             lines.append(between.join(repr(float(v)) for v in numbers))
     fx, fy, cx, cy = camera.params
     if simulated:
-        (path / "info.txt").write_text("depth and trajectory in dm\n")
+        (path / "info.txt").write_text("depth and trajectory in dm\n", encoding="utf-8")
         (path / "calibration.txt").write_text(
-            f"fx: {fx!r}\nfy: {fy!r}\ncx: {cx!r}\ncy: {cy!r}\n\ncols: {camera.width}\nrows: {camera.height}\n"
+            f"fx: {fx!r}\nfy: {fy!r}\ncx: {cx!r}\ncy: {cy!r}\n\ncols: {camera.width}\nrows: {camera.height}\n",
+            encoding="utf-8",
         )
     else:
         place = path.resolve().parent / "Calibration"
         place.mkdir(exist_ok=True)
-        (place / "cam.txt").write_text(f"{fx!r},0,{cx - 0.5!r},0,{fy!r},{cy - 0.5!r},0,0,1\n")
+        (place / "cam.txt").write_text(f"{fx!r},0,{cx - 0.5!r},0,{fy!r},{cy - 0.5!r},0,0,1\n", encoding="utf-8")
     if len(lines) > 1:
         name = "trajectory.csv" if simulated else f"{path.name.lower()}_position_rotation.csv"
-        (poses / name).write_text("\n".join(lines) + "\n")
+        (poses / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _rendered(path: Path) -> dict[int, str]:
@@ -148,7 +149,7 @@ def _simulated(path: Path) -> bool:
 def _read_calibration(path: Path) -> CameraModel:
     """`fx: 1.0` and so on, a line each."""
     found = {}
-    for line in path.read_text(errors="replace").splitlines():
+    for line in path.read_text(errors="replace", encoding="utf-8-sig").splitlines():
         key, colon, value = line.partition(":")
         try:
             found[key.strip()] = float(value) if colon else 0.0
@@ -171,7 +172,7 @@ def _poses(path: Path) -> dict[int, np.ndarray]:
         info = path / "info.txt"
         if not file.is_file():
             return {}
-        if not info.is_file() or "dm" not in info.read_text(errors="replace").lower().split():
+        if not info.is_file() or "dm" not in info.read_text(errors="replace", encoding="utf-8-sig").lower().split():
             raise InputError(info, "does not say that lengths are in dm", f"restore it, or remove {file.name}")
     else:
         files = sorted((path / "Poses").glob("*.csv")) if _rendered(path) else []

@@ -132,14 +132,18 @@ def write_folder(frames: Iterable[Frame], path: Path) -> None:
 
 def write_times(path: Path, times: Mapping[str, float]) -> None:
     """times.csv: the time [s] of frames by name, to the microsecond."""
-    path.write_text("name,seconds\n" + "".join(f"{name},{time:.6f}\n" for name, time in times.items()))
+    path.write_text(
+        "name,seconds\n" + "".join(f"{name},{time:.6f}\n" for name, time in times.items()),
+        encoding="utf-8",
+        errors="surrogateescape",  # names of files that are not UTF-8 come back as they are
+    )
 
 
 def read_times(path: Path) -> dict[str, float]:
     """Times [s] of frames by name."""
     times = {}
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(path, f"cannot be read as times of frames ({error})", "expected lines NAME,seconds") from error
     for row, line in enumerate(lines[1:], 2):

@@ -120,7 +120,9 @@ def write_simcol(frames: Sequence[Frame], path: Path) -> None:
     if positions:
         np.savetxt(path.parent / f"{_POSITION}_{_scene(path)}.txt", positions)
         np.savetxt(path.parent / f"{_ROTATION}_{_scene(path)}.txt", quaternions)
-    (path.parent / "cam.txt").write_text(" ".join(repr(float(v)) for v in camera.matrix.ravel()) + "\n")
+    (path.parent / "cam.txt").write_text(
+        " ".join(repr(float(v)) for v in camera.matrix.ravel()) + "\n", encoding="utf-8"
+    )
 
 
 def _scene(path: Path) -> str:
@@ -166,7 +168,7 @@ def _read_poses(path: Path) -> np.ndarray | None:
 
 def _numbers(path: Path, columns: str) -> np.ndarray:
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        rows = np.loadtxt(path, ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(path, f"not lines of numbers ({error})", f"expected `{columns}` on each") from error
     if rows.shape[1] != len(columns.split()):

@@ -108,7 +108,8 @@ def _npy(stream: BinaryIO) -> Header:
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(stream)
-    height, width = (*shape, 1, 1)[:2]
+    picture = len(shape) == 2 or (len(shape) == 3 and shape[2] in (1, 3, 4))
+    height, width = shape[:2] if picture else (0, 0)  # which is refused when it is read
     return Header("NPY", int(width), int(height), dtype not in (np.uint8, np.bool_))
 
 

@@ -107,7 +107,7 @@ def decode_raw(data: bytes, where: str) -> np.ndarray:
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height as stored, from the file's header alone where it has a legible one."""
     head = header_of(path)
-    if head is not None:
+    if head is not None and head.width:
         return head.width, head.height
     height, width = read_pixels(path).shape[:2]
     return width, height
@@ -115,7 +115,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def write_image(path: Path, pixels: np.ndarray, quality: int | None = None) -> None:
     """A picture, (H, W) grey or (H, W, 3) BGR as cv2 has it, in the format of its ending; `quality` is a JPEG's, in
-    percent. cv2.imwrite says nothing where the disk is full, and knows no names that are not UTF-8."""
+    percent. cv2.imwrite says nothing where the disk is full, and dies of names that are not UTF-8."""
     done, data = cv2.imencode(path.suffix, pixels, [] if quality is None else [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done, path
     try:

@@ -200,7 +200,9 @@ def _match(pc: Any, work: Path, pairs: list[tuple[str, str]], config: SfmConfig,
     pairing.match_list_path = work / "pairs.txt"
     for start in range(0, len(pairs), piece):
         progress("matches", start, len(pairs))
-        (work / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs[start : start + piece]))
+        (work / "pairs.txt").write_text(
+            "".join(f"{a} {b}\n" for a, b in pairs[start : start + piece]), encoding="utf-8"
+        )
         pc.match_image_pairs(
             work / "database.db",
             matching_options=matching,

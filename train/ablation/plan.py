@@ -113,7 +113,7 @@ def plans_of(
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        values = yaml.safe_load(path.read_text())
+        values = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(
             path, f"cannot be read as a training preset ({error})", "expected a YAML like configs/train/*.yaml"
