@@ -42,10 +42,12 @@ def scene() -> list[np.ndarray]:
 
 
 def write(folder: Path, combination: Combination | None, plain_of: Combination | None = None, count: int = 4) -> Path:
-    """A sequence of the scene's pictures, with camera, light, mask and truth: plain PNGs, or a combination's files."""
+    """A sequence of the scene's pictures, with camera, light and mask, and truth where there are so many that a verb
+    needs it: plain PNGs, or a combination's files."""
     frames = colon(0, 4, 6.0).frames
     (folder / "frames").mkdir(parents=True)
-    (folder / "truth" / "distance").mkdir(parents=True)
+    if count == COUNT["calibrate-light"]:
+        (folder / "truth" / "distance").mkdir(parents=True)
     write_camera(frames[0].camera, folder / "camera.json")
     write_light(frames[0].light, folder / "light.json")
     cv2.imwrite(str(folder / "mask.png"), 255 * frames[0].mask.astype(np.uint8))
@@ -55,7 +57,8 @@ def write(folder: Path, combination: Combination | None, plain_of: Combination |
         else:
             shown = pixels if plain_of is None else plain_of.plain(pixels)
             cv2.imwrite(str(folder / "frames" / f"{i:06d}.png"), shown[..., ::-1])
-        cv2.imwrite(str(folder / "truth" / "distance" / f"{i:06d}.tiff"), frames[i].true_distance)
+        if count == COUNT["calibrate-light"]:
+            cv2.imwrite(str(folder / "truth" / "distance" / f"{i:06d}.tiff"), frames[i].true_distance)
     return folder
 
 
