@@ -38,7 +38,7 @@ from lightdepth.datasets.folder import image_folder
 from lightdepth.datasets.format import Format, frames_of
 from lightdepth.datasets.scared_files import IMAGES, VIDEO, numbered_members
 from lightdepth.datasets.sequence import FrameSequence, along_ray
-from lightdepth.datasets.video import VideoFile
+from lightdepth.datasets.video import VideoFile, border_of
 from lightdepth.errors import InputError
 from lightdepth.files.images import decode_raw, image_size, read_raw, unit_range
 from lightdepth.frame import Frame
@@ -143,6 +143,9 @@ def _read_sequence(
     poses = {n: _pose(*record) for n, record in records.items()}
     view_from_left = np.eye(4) if view == "left" or calibration is None else calibration.right_from_left
     first_row = 0 if view == "left" else height
+    if mask is None:
+        found = border_of(video, slice(first_row, first_row + height))
+        mask = None if found.all() else found
     names = [f"{n:06d}" for n in numbers]
     # An archive is read from its start: its middle and end would cost minutes
     sampled = None if points is None or points.cheap else range(0, min(11, len(numbers)), 5 if len(numbers) > 5 else 1)
