@@ -91,6 +91,12 @@ def test_a_tiff_s_orientation_turns_neither_pixels_nor_size_in_either_byte_order
         assert np.array_equal(read_image(tmp_path / "a.tif"), pixels / np.float32(255))
 
 
+def test_a_tiff_s_alpha_darkens_nothing(tmp_path):
+    pixels = scene()[0]
+    (tmp_path / "a.tif").write_bytes(tiff([np.dstack([pixels, np.full(pixels.shape[:2], 100, np.uint8)])]))
+    assert np.array_equal(read_image(tmp_path / "a.tif"), pixels / np.float32(255))
+
+
 # ---- bit depth
 
 

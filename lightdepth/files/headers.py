@@ -20,6 +20,7 @@ from PIL import Image
 from lightdepth.errors import InputError
 
 _ORIENTATION, _WIDTH, _HEIGHT, _BITS, _SUBFILE, _SAMPLE_FORMAT = 274, 256, 257, 258, 254, 339
+_EXTRA_SAMPLES = 338
 _SIGNED, _FLOAT = 2, 3
 _TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _MOST_PAGES = 1000
@@ -66,16 +67,16 @@ def what_is_there(path: Path) -> str:
     return "a folder, not a file" if path.is_dir() else "a named pipe or a device, not a file"
 
 
-def unturned(data: bytes) -> bytes:
-    """A TIFF's bytes with its orientation set to `as stored`; others as they are."""
+def as_stored(data: bytes) -> bytes:
+    """A TIFF's bytes without what makes cv2 change its pixels: an orientation, and an alpha to multiply colours by."""
     if data[:2] not in (b"II", b"MM"):
         return data
     places = [place for found, _ in _pages(io.BytesIO(data)) for place in found]
     changed = bytearray(data)
     order = "<" if data[:2] == b"II" else ">"
     for place in places:
-        changed[place : place + 2] = struct.pack(order + "H", 1)
-    return bytes(changed)
+        changed[place : place + 2] = struct.pack(order + "H", 1)  # as stored, and already multiplied
+    return bytes(changed) if places else data
 
 
 def _read(stream: BinaryIO) -> Header | None:
@@ -130,7 +131,7 @@ def _tiff(stream: BinaryIO) -> Header:
 
 
 def _pages(stream: BinaryIO) -> list[tuple[list[int], dict[int, tuple[int, ...]]]]:
-    """A TIFF's pages: where the value of each one's orientation stands, and its tags of whole numbers."""
+    """A TIFF's pages: where orientation and kind of alpha stand that are not 1, and its tags of whole numbers."""
     start = stream.read(16)
     order = "<" if start[:2] == b"II" else ">"
     big = struct.unpack(order + "H", start[2:4])[0] == 43
@@ -160,7 +161,7 @@ def _pages(stream: BinaryIO) -> list[tuple[list[int], dict[int, tuple[int, ...]]
                 stream.seek(struct.unpack(order + field, held)[0])
                 held = stream.read(number * width)
             tags[tag] = struct.unpack(f"{order}{number}{_TYPES[kind]}", held[: number * width])
-            if tag == _ORIENTATION and kind == 3:
+            if tag in (_ORIENTATION, _EXTRA_SAMPLES) and kind == 3 and tags[tag] != (1,) and number == 1:
                 places.append(at + size + i * entry_size + 4 + struct.calcsize(field))
         found.append((places, tags))
         stream.seek(at + size + count * entry_size)

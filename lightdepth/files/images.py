@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from lightdepth.errors import InputError
-from lightdepth.files.headers import Header, header_in, header_of, unturned, what_is_there
+from lightdepth.files.headers import Header, as_stored, header_in, header_of, what_is_there
 
 PICTURE_SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".dib", ".tif", ".tiff", ".webp", ".jp2", ".j2k"),
@@ -140,14 +140,13 @@ def _single(data: bytes, where: str) -> Header | None:
 
 def decode(data: bytes, flags: int, where: str, head: Header | None = None) -> np.ndarray:
     """cv2's image in a file's bytes. imdecode refuses a truncated JPEG, whose rest imread would paint grey."""
-    turned = head is not None and head.kind == "TIFF" and head.orientation != 1
-    buffer, image = np.frombuffer(unturned(data) if turned else data, np.uint8), None
+    buffer, image = np.frombuffer(as_stored(data) if head is not None and head.kind == "TIFF" else data, np.uint8), None
     with suppress(cv2.error):  # of sizes and channels that it does not know
         image = cv2.imdecode(buffer, flags)
     if image is None and flags == _DECODE and head is not None and head.deep:
         with suppress(cv2.error):  # of floats with alpha it makes no three channels
             image = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
-        image = image[..., :3] if image is not None and image.ndim == 3 else None
+        image = np.ascontiguousarray(image[..., :3]) if image is not None and image.ndim == 3 else None
     if image is None:
         raise InputError(
             where, "not a readable image (truncated, or not an image at all)", "copy it again, or leave it out"
