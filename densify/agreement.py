@@ -44,30 +44,30 @@ class AgreementConfig:
     """What the keyframes of a submap must agree on."""
 
     on: bool = True
-    """Whether the keyframes of a submap are aligned together; switched off, each keeps its LMedS scale and nothing
-    bends."""
+    """Whether the keyframes of a submap, each with its own scale, are then fitted together and bent (see bending);
+    switched off, each keeps its one scale and nothing bends."""
     overlap: float = 0.03
-    """Weight of an overlap residual against a point's; at 0, keyframes are not compared with each other. A larger one
-    makes neighbours agree better, and fit their points less."""
+    """Weight, against 1 for a map point, of the disagreement of two keyframes at a pixel that both see; 0 compares
+    none, and live never does. A larger one makes keyframes agree better with each other, and fit their points less."""
     neighbours: int = 4
-    """Number of keyframes that each is compared with, those that share most points with it. More hold the submap
-    together better and take longer."""
+    """Number of keyframes that each is compared with, those that share most map points with it; live compares none.
+    More hold the submap together better and take longer."""
     samples: int = 16
-    """Number of pixels across the image that are compared, and as many down as keeps them square. More find finer
-    disagreement and take longer."""
+    """Number of pixels across the image at which keyframes are compared, and as many down as keeps the spacing equal;
+    live compares none. More find finer disagreement and take longer."""
     rounds: int = 8
-    """Largest number of Gauss-Newton rounds, each with weights and projections renewed. More come closer to the
-    solution and take longer."""
+    """Largest number of rounds (Gauss-Newton steps) in which keyframes are fitted together; tolerance may end them
+    sooner. More come closer to the solution and take longer."""
     tolerance: float = 1e-3
-    """Change in log distance; a round that changes nothing by more is the last. A larger one ends sooner, at a less
-    exact solution."""
+    """Change of the fit, in log distance (0.001 is 0.1 %), below which a round is the last. A larger one ends sooner,
+    at a less exact solution."""
     shared_error: float = 0.03
-    """Error, in log distance, that neighbouring points of a map share, as they were tracked together: however many
-    there are in a part of the image, they hold depth no more firmly. A larger one trusts dense maps less; 0 takes every
-    point for a witness of its own."""
+    """Error, in log distance (0.03 is 3 %), that map points in the same part of an image (of 8 x 8) have in common:
+    however many they are, they count for no more than one point with that error. A larger one fits depth less closely
+    to crowded points; 0 counts each on its own."""
     max_gap: float = 0.5
-    """Overlap residual, in log distance, from which two pixels count as different tissue (occlusion) and are not
-    compared. A larger one compares more pixels."""
+    """Disagreement, in log distance (0.5 is a factor of 1.6), from which two keyframes count as seeing different tissue
+    at a pixel and are not compared there; live compares none. A larger one compares more pixels."""
 
 
 @dataclass(frozen=True, repr=False)

@@ -29,36 +29,42 @@ class AlignmentConfig:
     """When a keyframe's scale is found, and when it is trusted."""
 
     estimator: Estimator = "lmeds"
-    """How the first scale is found: lmeds, by the least median of squares, or median, the median of the ratios, which
-    is never refined and serves to compare with."""
+    """How a keyframe's first scale is found from its points' ratios of mapped to predicted distance: lmeds takes the
+    ratio with the least median of squared residuals, median the median ratio. median is never refined (refine, loss),
+    and serves to compare with."""
     t: float = 2.5
-    """Number of sigmas up to which a residual makes an inlier. More take in more points, wrong ones among them."""
+    """Number of sigmas (sigma is the robust standard deviation of a keyframe's residuals) within which a map point is
+    an inlier, that is counts as right. More take in more points, wrong ones among them."""
     finite_sample: bool = False
-    """Whether sigma is widened by Rousseeuw's factor 1 + 5 / (n - 1), which matters where n points are few."""
+    """Whether sigma is widened by Rousseeuw's factor 1 + 5 / (n - 1), n the keyframe's number of points. Switched on,
+    keyframes with few points keep more of them as inliers, wrong ones too; with many it makes no difference."""
     refine: bool = True
-    """Whether the LMedS scale is refined on its inliers by robust least squares."""
+    """Whether the scale found by lmeds, which is the ratio of a single point, is refined on all inliers by robust least
+    squares; switched off, it stays as found. With the estimator median it does nothing."""
     loss: Loss = "geman_mcclure"
-    """Robust loss of the refinement: geman_mcclure, huber, cauchy or tukey."""
+    """Robust loss of that refinement: geman_mcclure, huber, cauchy or tukey. An inlier that is off by 2.5 sigmas keeps
+    a weight of 0.02 with geman_mcclure, and of about 0.5 with each of the others."""
     min_points: int = 8
-    """Least number of observed points with a prediction, withheld ones not counted, that a keyframe needs to be
-    aligned. More make scales safer and leave out more keyframes."""
+    """Least number of map points, observed where the model predicts a distance, that a keyframe needs; one with fewer
+    is left out of the surface. More make scales safer and leave out more keyframes."""
     min_inliers: int = 6
-    """Least number of points within t sigma that a keyframe needs. More make scales safer and leave out more
-    keyframes."""
+    """Least number of inliers (points within t sigmas) that a keyframe needs; one with fewer is left out of the
+    surface. More make scales safer and leave out more keyframes."""
     min_inlier_share: float = 0.5
-    """Least share of the observed points that must be inliers. A larger one leaves out more keyframes."""
+    """Least share, in [0, 1], of a keyframe's observed points that must be inliers; with less it is left out of the
+    surface. A larger one leaves out more keyframes."""
     max_relative_sigma: float = 0.35
-    """Largest sigma of the residuals, as a share of the median mapped distance. A larger one trusts keyframes whose
-    points disagree more."""
+    """Largest sigma (robust standard deviation of a keyframe's residuals), as a share of its points' median distance,
+    with which a keyframe is used. A larger one also uses keyframes whose points disagree more."""
     min_spread_deg: float = 3.0
-    """Least root mean square angle between the inliers' rays and their mean, degrees. A larger one leaves out
-    keyframes whose inliers lie close together in the image."""
+    """Least spread of a keyframe's inliers over its view, degrees: the root mean square angle between their rays and
+    the mean ray. A larger one leaves out keyframes whose inliers lie close together in the image."""
     min_distance_spread: float = 0.02
-    """Least standard deviation of the inliers' log distance. A larger one leaves out keyframes whose inliers are all
-    about equally far."""
+    """Least standard deviation of the log distance of a keyframe's inliers (0.02 is about 2 %). A larger one leaves out
+    keyframes whose inliers are all about equally far, which tell nothing of other distances."""
     max_second_mode: float = 0.6
-    """Largest ratio of the points that agree on another scale to those that agree on this one. A larger one trusts
-    keyframes with a stronger rival."""
+    """Largest ratio of the number of points that agree on a rival scale to the number that agree on the one found;
+    above it the keyframe is left out. A larger one also uses keyframes with a stronger rival."""
 
     def __post_init__(self) -> None:
         if self.estimator not in get_args(Estimator):
@@ -77,7 +83,7 @@ class Alignment(Brief):
 
     `ok`, or else `reason` says why the keyframe is left out. `range_90` is the 90th percentile of the distance of the
     LMedS inliers. `bend` is the smooth field that the depth is bent by, where there is one; `unbent_because` says why
-    one that was found is not used.
+    what was found is not used, or only a part of it.
     """
 
     keyframe: str

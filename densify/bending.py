@@ -27,14 +27,18 @@ class BendingConfig:
     """How a keyframe's depth may bend. Off, it is scaled only."""
 
     on: bool = True
-    """Whether a keyframe's depth may bend; switched off, it is only scaled."""
+    """Whether a keyframe's depth is multiplied by a smooth field over the image, its bend, so that it fits the map's
+    points; switched off, it is multiplied by one number."""
     grids: tuple[int, ...] = (5,)
-    """Number of bumps across and down, one number for each level. More let depth bend in finer detail."""
+    """Number n of smooth bumps across and down the image that make up the bend, n x n of them, at least 2; several
+    numbers lay several such grids over each other. More let depth bend in finer detail."""
     slope_deviation: float = 0.3
-    """Expected size of the slope of the bend: change of the log factor on depth per change of log predicted
-    distance, of either sign; 0 switches the slope off. A larger one lets near and far be stretched more freely."""
+    """Expected size (standard deviation) of the bend's slope, a ratio: change of the log of depth's factor per change
+    of the log of predicted distance; 0 switches the slope off. A larger one lets near wall be stretched against far
+    wall more freely."""
     bump_deviation: float = 0.1
-    """Expected size of a bump, in log distance. A larger one lets depth bend more strongly."""
+    """Expected size (standard deviation) of each bump of the bend, in log distance (0.1 is 10 %), above 0. A larger one
+    lets depth bend more strongly."""
 
     def __post_init__(self) -> None:
         if any(n < 2 for n in self.grids):

@@ -12,6 +12,7 @@ from densify.contradiction import ContradictionConfig
 from densify.coverage import CoverageConfig
 from densify.fusion.rectify import RectifyConfig
 from densify.fusion.volume import FusionConfig
+from densify.judging.ahead import AheadConfig
 from densify.judging.config import JudgeConfig
 from lightdepth.errors import InputError
 
@@ -42,7 +43,7 @@ class MethodConfig:
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     """when a keyframe's scale is found and trusted"""
     agreement: AgreementConfig = field(default_factory=AgreementConfig)
-    """how keyframes are aligned together, beyond one scale each (--agreement.overlap 0 switches overlap off)"""
+    """how keyframes are fitted together, beyond one scale each (--agreement.on false leaves that out)"""
     bending: BendingConfig = field(default_factory=BendingConfig)
     """how depth may bend towards the map's points (--bending.on false switches it off)"""
     rectify: RectifyConfig = field(default_factory=RectifyConfig)
@@ -59,6 +60,8 @@ class LiveConfig(MethodConfig):
     """resolution and reach of the surface"""
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
     """when wall counts as seen well"""
+    judge: AheadConfig = field(default_factory=AheadConfig)
+    """whether points that come later judge the surface (--judge.on false leaves that out)"""
 
 
 @dataclass(frozen=True)
@@ -82,11 +85,12 @@ class DensifyConfig(OfflineConfig):
     judge: JudgeConfig = field(default_factory=JudgeConfig)
     """how the result is judged, and bends that make it worse are undone (--judge.on false leaves that out)"""
     recipe: Recipe = "full"
-    """How dense maps are made: full, or paper, which is one LMedS scale per keyframe, one undistorted pinhole image,
-    and a plain TSDF. It has no agreement, bending, contradiction or rectification, and takes no settings of these."""
+    """How dense maps are made: full, with all steps below, or paper, as published: one LMedS scale per keyframe, one
+    undistorted pinhole image, a plain TSDF. paper refuses settings of agreement, bending, contradiction and rectify,
+    which it has not, and ignores coverage and fusion.min_views."""
     keep_mb: float = 1000.0
-    """Memory for the frames and predictions of a submap that are kept between the passes over it, megabytes; others
-    are made again. More save time and change nothing else."""
+    """Memory, megabytes, for the images and predictions of a submap that are kept from one pass over it to the next;
+    what does not fit is read and predicted again. More save time and change nothing else."""
 
     def __post_init__(self) -> None:
         if self.recipe not in ("full", "paper"):

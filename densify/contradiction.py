@@ -27,15 +27,17 @@ class ContradictionConfig:
     """When a pixel is contradicted."""
 
     on: bool = True
-    """Whether pixels that nearer keyframes contradict are left out of the surface; switched off, they stay."""
+    """Whether a pixel is left out of the surface where keyframes nearer to the wall look through it and see wall
+    farther on; switched off, it stays."""
     tolerance: float = 0.05
-    """Difference in log distance up to which two keyframes agree on a pixel. A larger one leaves out fewer pixels."""
+    """Difference, in log distance (0.05 is 5 %), up to which two keyframes agree on a pixel; only beyond it can one
+    contradict the other. A larger one leaves out fewer pixels."""
     judges: int = 8
-    """Number of keyframes that each is compared with, evenly chosen among those that share points with it. More find
-    more contradictions and take longer."""
+    """Number of other keyframes that each is compared with, evenly chosen among those that share map points with it.
+    More have more pixels compared and take longer."""
     samples: int = 80
-    """Number of pixels across the image that are compared. More tell the edges of what is contradicted more finely
-    and take longer."""
+    """Number of pixels across the image that are compared, and in proportion down; each speaks for the cell around it.
+    More tell the edges of what is left out more finely and take longer."""
 
 
 def uncontradicted(

@@ -1,7 +1,8 @@
 """What of the wall was seen, how well, and what was not: confidence, weakly seen patches, holes.
 
-A vertex has been seen well when enough keyframes saw it with enough weight: a keyframe that looks straight at a lit
-wall counts 1; a slanted, dark, saturated or uncertain look counts less. A hole is a rim of the surface that runs around
+A vertex has been seen well when enough keyframes saw it with enough weight (a keyframe that looks straight at a lit
+wall counts 1; a slanted, dark, saturated or uncertain look counts less), and when it is expected to be off by little:
+looks from afar err together, however many they are (densify.trust). A hole is a rim of the surface that runs around
 missing wall; the rims at the two ends of a piece of tube, and the outer rim of a patch, are not holes.
 """
 
@@ -14,8 +15,9 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from densify.dense_map import Contribution, DenseMap
+from densify.dense_map import DOUBTED, Contribution, DenseMap
 from densify.fusion.rectify import FULL, SurfaceView
+from densify.trust import coarse_sigma, expected_error, vertex_normals
 from lightdepth.datasets import FrameSequence
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Keyframe
@@ -26,14 +28,18 @@ class CoverageConfig:
     """When wall counts as seen well, and what is too small to mention."""
 
     views: int = 3
-    """Least number of keyframes that must have seen a piece of wall for it to count as seen well. More make that
-    claim stricter."""
+    """Least number of keyframes that must have seen a piece of wall for the report to call it seen well; the surface
+    stays as it is. More make less wall count as seen well."""
     weight: float = 1.0
-    """Least weight of all the looks at it together: a keyframe that looks straight at lit wall counts 1, a slanted,
-    dark, saturated or uncertain look less. A larger one makes the claim stricter."""
+    """Least sum of the weights of all looks at a piece of wall for it to be called seen well: a keyframe looking
+    straight at lit wall counts 1, a slanted, dark, saturated or uncertain look less. A larger one makes less wall count
+    as seen well."""
+    error: float = DOUBTED
+    """Largest error that may be expected of a vertex, as a share of the distance of a typical inlier. A
+    larger one calls more wall seen well, and more of it is wrong."""
     min_voxels: float = 5.0
-    """Side of a square, in voxels, below whose area weakly seen patches and holes are not listed. A larger one lists
-    fewer."""
+    """Side of a square, in voxels: holes and weakly seen patches of a smaller area than its are not listed in the
+    report. A larger one lists fewer."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +98,10 @@ def triangle_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def seen_well(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> np.ndarray:
     """Which vertices (n,) were seen well."""
     assert dense.weights is not None and dense.views is not None
-    return (dense.views >= config.views) & (dense.weights >= config.weight)
+    well: np.ndarray = (dense.views >= config.views) & (dense.weights >= config.weight)
+    if dense.expected_error is not None and dense.aligned:
+        well &= dense.expected_error <= config.error * dense.inlier_distance
+    return well
 
 
 def coverage(dense: DenseMap, config: CoverageConfig = CoverageConfig()) -> Coverage:
@@ -138,10 +147,25 @@ def looked_at(dense: DenseMap, keyframe: Keyframe, given: Contribution, stride: 
     return replace(given, confidence=float(dense.confidence[corners].mean()), views=float(dense.views[corners].mean()))
 
 
-def with_contributions(dense: DenseMap, given: Mapping[str, Contribution]) -> DenseMap:
-    """The dense map with what each of its aligned keyframes gave, by name, and what it looks at."""
-    found = {k.name: looked_at(dense, k, given[k.name]) for k in dense.submap.keyframes if k.name in given}
-    return replace(dense, contributions=found)
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What a keyframe gave to the fusion, and the coarse uncertainty (h, w) of its prediction, where it has one."""
+
+    contribution: Contribution
+    sigma: np.ndarray | None
+
+    @classmethod
+    def of(cls, view: SurfaceView, prediction: DepthPrediction) -> Given:
+        return cls(contribution(view, prediction), coarse_sigma(prediction))
+
+
+def with_contributions(dense: DenseMap, given: Mapping[str, Given]) -> DenseMap:
+    """The dense map with the error that is expected of its vertices, with what each of its aligned keyframes gave, by
+    name, and what it looks at."""
+    sigmas = {name: g.sigma for name, g in given.items() if g.sigma is not None}
+    dense = replace(dense, expected_error=expected_error(dense, sigmas))
+    own = [k for k in dense.submap.keyframes if k.name in given]
+    return replace(dense, contributions={k.name: looked_at(dense, k, given[k.name].contribution) for k in own})
 
 
 def seen_share(dense: DenseMap, frames: FrameSequence, stride: int = 8) -> float:
@@ -162,7 +186,7 @@ def find_holes(vertices: np.ndarray, triangles: np.ndarray) -> list[tuple[float,
     along it: around missing wall, A points against n; at the outer rim of a patch, with it; and at the open end of a
     tube the normals, which point inwards from all sides, cancel.
     """
-    normals = _vertex_normals(vertices, triangles)
+    normals = vertex_normals(vertices, triangles)
     found = []
     for rim in rims(triangles):
         points, middle = vertices[rim], vertices[rim].mean(0)
@@ -199,15 +223,6 @@ def rims(triangles: np.ndarray) -> list[np.ndarray]:
         if len(loop) > 2:
             loops.append(np.array(loop))
     return loops
-
-
-def _vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3), of triangles by their area; 0 where a vertex has no triangle."""
-    from trimesh.geometry import mean_vertex_normals
-    from trimesh.triangles import cross
-
-    result: np.ndarray = mean_vertex_normals(len(vertices), triangles, cross(vertices[triangles]))  # type: ignore[no-untyped-call]  # trimesh has no annotation for it
-    return result
 
 
 def patches(triangles: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:

@@ -23,6 +23,8 @@ from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.sparse_map import Keyframe, Submap
 
 GREEN, RED, GREY = (0, 170, 60), (220, 30, 30), (150, 150, 150)
+DOUBTED = 0.03
+"""Expected error of a vertex, as a share of the distance of a typical inlier, at which its confidence is one half."""
 
 
 class Surface:
@@ -82,7 +84,8 @@ class DenseMap(Brief):
     one for each keyframe of the submap, in order. `voxel` is the size of the fusion's voxels in the same unit.
 
     Where the fusion told them, weights (n,) of all views of a vertex together (1 is one view that nothing speaks
-    against), and the number of views (n,); and what each keyframe contributed, by name.
+    against), and the number of views (n,); the distance (n,) within which two in three vertices like it are expected
+    to lie from the true wall (densify.trust); and what each keyframe contributed, by name.
     """
 
     submap: Submap
@@ -95,6 +98,7 @@ class DenseMap(Brief):
     weights: np.ndarray | None = None
     views: np.ndarray | None = None
     contributions: Mapping[str, Contribution] = field(default_factory=dict)
+    expected_error: np.ndarray | None = None
 
     @classmethod
     def of(cls, volume: TsdfVolume, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
@@ -111,8 +115,22 @@ class DenseMap(Brief):
 
     @property
     def confidence(self) -> np.ndarray | None:
-        """In [0, 1): w / (1 + w) of a vertex's weight w; one half is one view that nothing speaks against."""
+        """In [0, 1): 1 / (1 + e²), e being a vertex's expected error in units of what is doubted, so that one half is
+        where doubt begins. Where no error is expected for want of a map, w / (1 + w) of its weight w."""
+        if self.expected_error is not None and self.aligned:
+            return 1 / (1 + (self.expected_error / (DOUBTED * self.inlier_distance)) ** 2)
         return None if self.weights is None else self.weights / (1 + self.weights)
+
+    @cached_property
+    def inlier_distance(self) -> float:
+        """A typical distance from aligned keyframes to their inliers: the median of their medians, which wrong points
+        do not change; 0 without any."""
+        medians = []
+        for keyframe, alignment in zip(self.submap.keyframes, self.alignments, strict=True):
+            rows, held = self.submap.rows_of(alignment.inlier_ids)
+            if alignment.ok and held.any():
+                medians.append(np.median(np.linalg.norm(keyframe.in_camera(self.submap.points[rows[held]]), axis=1)))
+        return float(np.median(medians)) if medians else 0.0
 
     @property
     def aligned(self) -> list[Alignment]:
@@ -152,6 +170,8 @@ class DenseMap(Brief):
             if suffix == "ply" and self.confidence is not None and self.views is not None and len(self.vertices):
                 mesh.vertex_attributes["confidence"] = self.confidence.astype(np.float32)
                 mesh.vertex_attributes["views"] = self.views.astype(np.int32)
+                if self.expected_error is not None and self.aligned:
+                    mesh.vertex_attributes["expected_error"] = (self.expected_error * scale).astype(np.float32)
             mesh.export(folder / f"mesh.{suffix}")
         normals = mesh.vertex_normals if len(self.vertices) else np.zeros((0, 3))
         write_cloud(folder / "cloud.ply", self.vertices * scale, rgba[:, :3], normals)
@@ -202,8 +222,8 @@ def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.
 @dataclass(frozen=True, repr=False)
 class DenseMapFiles(Brief):
     """A dense map read back from its folder: the surface, the sparse points with their colours, the keyframes' frame
-    numbers and poses map_from_cam (n, 4, 4), and the map's camera; confidence and views of each vertex, where the file
-    has them."""
+    numbers and poses map_from_cam (n, 4, 4), and the map's camera; confidence, views and expected error of each vertex,
+    where the file has them."""
 
     id: int
     vertices: np.ndarray
@@ -215,6 +235,7 @@ class DenseMapFiles(Brief):
     camera: CameraModel
     confidence: np.ndarray | None = None
     views: np.ndarray | None = None
+    expected_error: np.ndarray | None = None
 
 
 def map_folders(path: Path) -> list[Path]:
@@ -245,7 +266,8 @@ def read_dense_map(folder: str | Path) -> DenseMapFiles:
     # trimesh keeps what it has no name for in the raw file: a structured array, or a dict of columns
     raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {}) if len(triangles) else {}
     names = raw.dtype.names if isinstance(raw, np.ndarray) else tuple(raw)
-    own = {name: np.asarray(raw[name]).ravel() if name in names else None for name in ("confidence", "views")}
+    wanted = ("confidence", "views", "expected_error")
+    own = {name: np.asarray(raw[name]).ravel() if name in names else None for name in wanted}
     return DenseMapFiles(
         id=int(map_id),
         vertices=np.asarray(getattr(mesh, "vertices", np.zeros((0, 3))), float),  # an empty mesh is read as a scene

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
 from densify.joining import MergeConfig, Merged, joined_name, merge
+from densify.judging.doubts import DoubtsCalibrated, calibrated_together
 from densify.judging.verdict import Colour, Verdict, proposal, worst
 from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify
 from densify.predictions import SeenKeyframe
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
+from lightdepth.hidden_uncertainty import FILE
 from lightdepth.models import DepthModel
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, plain
@@ -64,6 +68,19 @@ class Densified:
         colour: Colour = "red" if found.colour == "red" else "amber"
         return Verdict(colour, "; ".join([*self.doubts, found.sentence]))
 
+    @cached_property
+    def uncertainty(self) -> DoubtsCalibrated | None:
+        """The calibration of the predicted uncertainty on hidden blocks of all maps; None where there is none to
+        calibrate, or nothing was judged."""
+        return calibrated_together([r.judgement.doubts for r in self.results if r.judgement is not None])
+
+    @property
+    def of_uncertainty(self) -> str:
+        """Whether the predicted uncertainty was calibrated, in one sentence."""
+        if not any(r.judgement for r in self.results):
+            return "not calibrated: nothing was judged"
+        return str(self.uncertainty or f"not calibrated: {self.model} predicts none")
+
     def proposals(self) -> dict[int, str]:
         """What could make a map better, by its id, where the images speak against it."""
         told = {r.dense.submap.id: proposal(r.judgement) for r in self.results if r.judgement is not None}
@@ -76,6 +93,7 @@ class Densified:
         notes = [f"Verdict: {self.verdict}."] if self.verdict is not None else []
         notes += [f"{of}; depth by {self.model}; light of the frames: {under}."]
         notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
+        notes.append(f"Uncertainty: {self.of_uncertainty}.")
         submaps = [result.dense.submap for result in self.results]
         weak = [str(s.id) for s in submaps if s.weak_visibility]
         if weak:
@@ -99,6 +117,7 @@ class Densified:
         if self.verdict is not None:
             run.log(f"verdict: {self.verdict}")
             run.record["verdict"] = plain(self.verdict)
+        self._write_uncertainty(run)
         records = []
         for result in self.results:
             dense, judgement = result.dense, result.judgement
@@ -138,6 +157,15 @@ class Densified:
         run.record.update(
             {"unit": "mm" if mm_per_unit else "map units", "checkpoint": self.model, "maps": plain(records)}
         )
+
+    def _write_uncertainty(self, run: Run) -> None:
+        """Says whether the uncertainty was calibrated; where it was, `predict --uncertainty` takes what is written."""
+        found = self.uncertainty
+        run.log(f"uncertainty: {self.of_uncertainty}")
+        run.record["uncertainty"] = {"sentence": self.of_uncertainty, **({} if found is None else found.record())}
+        if found is not None and found.predicted.ok:
+            told = {"checkpoint": self.model, "factor": found.predicted.factor, **found.record()}
+            (run.folder / FILE).write_text(json.dumps(plain(told), indent=2) + "\n", encoding="utf-8")
 
     def _say_if_few(self, run: Run) -> None:
         """Surfaces of a map of which most keyframes could not be aligned are written, but part of the work failed."""

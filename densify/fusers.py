@@ -11,8 +11,8 @@ from densify.aligned import AlignedKeyframe
 from densify.alignment import Alignment
 from densify.config import DensifyConfig, MethodConfig
 from densify.contradiction import without
-from densify.coverage import contribution, with_contributions
-from densify.dense_map import Contribution, DenseMap
+from densify.coverage import Given, with_contributions
+from densify.dense_map import DenseMap
 from densify.fusion.plain import PlainTsdf, undistorted
 from densify.fusion.rectify import SurfaceView, surface_view
 from densify.fusion.volume import TsdfVolume
@@ -50,7 +50,7 @@ class FullFuser:
 
     def __init__(self, voxel: float, config: DensifyConfig) -> None:
         self._config, self._volume = config, TsdfVolume(voxel, config.fusion)
-        self._contributions: dict[str, Contribution] = {}
+        self._given: dict[str, Given] = {}
 
     def add(self, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
         assert seen.frame is not None and seen.prediction is not None
@@ -59,10 +59,10 @@ class FullFuser:
             prediction = replace(prediction, valid=without(prediction.valid, aligned.stays))
         view = view_to_fuse(aligned.alignment, prediction, seen.frame.image, self._config)
         self._volume.integrate(view, aligned.keyframe.cam_from_map)
-        self._contributions[aligned.keyframe.name] = contribution(view, prediction)
+        self._given[aligned.keyframe.name] = Given.of(view, prediction)
 
     def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
-        return with_contributions(DenseMap.of(self._volume, submap, alignments), self._contributions)
+        return with_contributions(DenseMap.of(self._volume, submap, alignments), self._given)
 
 
 class PaperFuser:

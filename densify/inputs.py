@@ -30,10 +30,11 @@ class MapSource(PairingConfig):
     """A sparse map, and what is asked of it."""
 
     map: Path | None = None
-    """Sparse map of the frames: COLMAP model(s) or a multi-map tree; left out, pycolmap makes one from the frames."""
+    """Sparse map of the frames (poses and points of a SLAM): COLMAP model(s) or a multi-map tree; left out, pycolmap
+    makes one from the frames."""
     repair_map: bool = False
-    """Make the map anew from the images of its keyframes before it is used, beginning at its poses, and keep its frame
-    and scale; written to sparse/ in the run folder."""
+    """Make the map anew before it is used, by matching the images of its keyframes, beginning at its poses and keeping
+    its frame and scale; written to sparse/ in the run folder. Switched off, it is used as it is."""
 
 
 def map_and_frames(

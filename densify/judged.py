@@ -42,20 +42,22 @@ class TruthSource:
     """What is judged against, and how it is read."""
 
     truth: Path | None = None
-    """Sequence with true depth, and for maps with true poses; left out, a densify run's withheld points judge."""
+    """Folder of the sequence with true depth (and, to judge maps, true poses); left out, a densify run is judged by its
+    map points that were hidden from the alignment."""
     format: FormatName | None = None
     """Format of the truth: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking if
     left out."""
     camera: Path | None = None
-    """Calibration file that wins over the truth's own."""
+    """Calibration file, which wins over the one beside the truth."""
     mask: Path | None = None
-    """Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one."""
+    """Image, white where tissue shows and black elsewhere: only there is judged; left out, the truth folder's own mask,
+    where it has one."""
     bit_depth: int | None = None
     """Bits of a sample in the truth's pictures that are stored in more than 8; left out, what the files say, else what
     their highest values show. A larger one reads the same numbers as darker."""
     truth_mesh: Path | None = None
-    """File of the true surface, mm, in the frame of the true poses; left out, C3VD's own or triangulated true
-    depth."""
+    """Mesh file of the true surface, in mm and in the frame of the true poses; left out, C3VD's own where it lies
+    beside the frames, else one made of true depth."""
 
     def sequence(self, folder: Path) -> SequenceSource:
         """A folder of the truth: itself, or one of its sequences."""
@@ -67,18 +69,20 @@ class JudgingConfig:
     """How errors are taken."""
 
     mm_per_unit: float | None = None
-    """Millimetres per map unit, where known: the error after SE(3) needs it. A larger one makes a larger surface."""
+    """Millimetres per map unit, where known, for the trajectory's error after SE(3), that is without fitting its scale;
+    left out, only runs in mm have that figure. A larger one takes the trajectory for larger; other errors stay."""
     thresholds_mm: tuple[float, ...] = THRESHOLDS_MM
-    """Distances, mm, up to which a point counts as right in precision, recall and F-score. Larger ones count more
-    points."""
+    """Distances, mm, up to which a surface point counts as right in precision, recall and F-score, each with figures of
+    its own. Larger ones count more points."""
     max_depth_mm: float = 100.0
-    """True depth along the camera's axis, mm, beyond which pixels take no part in the errors of predictions (a
-    predict folder; surfaces are judged without it). A larger one judges farther wall too."""
+    """True depth along the camera's axis, mm, beyond which pixels are not judged in a folder of predictions; surfaces
+    are judged whole. A larger one judges farther wall too."""
     common: bool = False
-    """Judge only the frames that both sides have, where there are others."""
+    """Judge only the frames that the truth has as well; switched off, it is an error where some frames have no
+    truth."""
     trust_truth: bool = False
-    """Judge even by truth that contradicts its own poses by more than 2 %, or whose unit is unlikely to be
-    millimetres."""
+    """Judge even by truth that contradicts its own poses by more than 2 %, or whose unit is unlikely to be millimetres;
+    switched off, that is an error."""
     trust_map: bool = False
     """Go on with a map whose frames, by their images, are others than those that it was made of, and only warn."""
 

@@ -1,4 +1,4 @@
-"""The judge of a submap: it hides blocks of wall, asks the images, undoes bends that make things worse, and speaks.
+"""The judge of a submap: it hides blocks of wall, asks the images, lessens bends that make things worse, and speaks.
 
 It goes along with the pipeline: it sees every keyframe as it is predicted, judges the bends once they are all aligned,
 and the surface once it is there. The surface rests on every point of the map; what is hidden is hidden from alignments
@@ -14,17 +14,21 @@ import numpy as np
 
 from densify.agreement import unbent
 from densify.aligned import AlignedKeyframe
+from densify.alignment import bent
 from densify.bending import Bend
 from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
-from densify.judging.brake import Tried, undone
-from densify.judging.columns import Columns, FourWays, Method, hidden_errors
+from densify.judging.brake import SHARES, Kept, Tried, kept
+from densify.judging.columns import Columns, FourWays, Method, hidden_errors, hidden_ratios
+from densify.judging.doubts import Doubts, sigma_at
 from densify.judging.images import Images, Seen
 from densify.judging.verdict import Judgement
 from densify.judging.withheld import Withheld
 from densify.predictions import SeenKeyframe
 from lightdepth.blocks import submap_folds
-from lightdepth.sparse_map import Keyframe, Submap
+from lightdepth.hidden_uncertainty import HiddenErrors
+from lightdepth.sparse_map import Submap
+from lightdepth.triangulation import PointNoise
 
 
 class Judge:
@@ -36,33 +40,37 @@ class Judge:
         self._method = Method(config.alignment, config.agreement, config.bending)
         self._images = Images(config.judge.parallax)
         self._fold = submap_folds(submap, config.judge.folds, config.judge.seed)
+        self._ratios: dict[str, np.ndarray] = {}
         self._blocks: dict[str, np.ndarray] = {}
+        self._sigma: dict[str, np.ndarray] = {}
         self._told: dict[str, Seen] = {}
-        self._undone: dict[str, str] = {}
+        self._kept: dict[str, Kept] = {}
 
-    def see(self, keyframe: Keyframe, seen: SeenKeyframe) -> None:
-        """Keeps what the images of a keyframe will be asked for."""
+    def see(self, k: AlignedKeyframe, seen: SeenKeyframe) -> None:
+        """Keeps what the images of a keyframe will be asked for, and the uncertainty predicted of its points."""
         if self._config.judge.on and seen.frame is not None and seen.prediction is not None:
-            self._images.see(keyframe, seen.frame, seen.prediction)
+            self._images.see(k.keyframe, seen.frame, seen.prediction)
+            sigma = None if k.observed is None else sigma_at(seen.prediction, k.observed.pixels)
+            if sigma is not None:
+                self._sigma[k.keyframe.name] = sigma
 
     def braked(self, keyframes: Sequence[AlignedKeyframe]) -> list[AlignedKeyframe]:
-        """The same keyframes, those whose bend makes things worse at one scale, with the reason."""
+        """The same keyframes, each with as much of its bend as makes things better, and the reason for less."""
         self._ask(keyframes)
-        bent = {k.keyframe.name: self._tried(k) for k in keyframes if k.alone is not None and k.alignment.bend}
-        self._undone = undone(bent) if self._config.judge.on else {}
-        return [self._at_one_scale(k) if k.keyframe.name in self._undone else k for k in keyframes]
+        tried = {k.keyframe.name: self._tried(k) for k in keyframes if k.alone is not None and k.alignment.bend}
+        self._kept = kept(tried) if self._config.judge.on else {}
+        return [self._lessened(k) if k.keyframe.name in self._kept else k for k in keyframes]
 
     def _ask(self, keyframes: Sequence[AlignedKeyframe]) -> None:
         """Hides blocks of wall, and measures between the images; once."""
         if self._blocks or not self._config.judge.on:
             return
-        self._told = self._images.measure(
-            self._submap, {k.keyframe.name: (k.alone or k.alignment).scale for k in keyframes if k.alignment.ok}
-        )
+        self._told = self._images.measure(self._submap)
         for k in keyframes:
             if k.view is not None and len(k.view.observed):
                 fold = self._fold[self._submap.rows_of(k.view.observed.point_ids)[0]]
-                self._blocks[k.keyframe.name] = hidden_errors(k.view, fold, self._method)
+                self._ratios[k.keyframe.name] = ratios = hidden_ratios(k.view, fold, self._method)
+                self._blocks[k.keyframe.name] = np.abs(ratios - 1)
 
     def judgement(self, dense: DenseMap, keyframes: Sequence[AlignedKeyframe]) -> Judgement | None:
         """What is known of the surface; None where the judge is switched off."""
@@ -92,25 +100,65 @@ class Judge:
             Withheld.of(dense, points),
             len(keyframes),
             sum(k.alignment.ok for k in keyframes),
-            len(self._undone),
+            sum(kept.share == 0 for kept in self._kept.values()),
+            sum(0 < kept.share < 1 for kept in self._kept.values()),
             float(np.median(sizes)) if sizes else 0.0,
+            self._doubts(keyframes),
         )
+
+    def _doubts(self, keyframes: Sequence[AlignedKeyframe]) -> Doubts | None:
+        """The hidden points with what uncertainty was predicted of them; None where none was."""
+        noise = PointNoise(self._submap) if self._sigma else None
+        predicted: list[HiddenErrors] = []
+        delivered: list[HiddenErrors] = []
+        for k in keyframes:
+            name, view = k.keyframe.name, k.view
+            if noise is None or view is None or name not in self._ratios or name not in self._sigma:
+                continue
+            told = self._ratios[name], self._sigma[name], noise.along(k.keyframe, view.observed.point_ids)
+            fold = self._fold[self._submap.rows_of(view.observed.point_ids)[0]]
+            use = np.isfinite(told[0][:, 0]) & (told[1] > 0)
+            ratio, sigma, spread = (each[use] for each in told)
+            where = fold[use], view.observed.pixels[use] / k.keyframe.camera.width
+            one, bend = np.log(ratio[:, :2]).T
+            for error, into in ((one, predicted), (one + self._share(k) * (bend - one), delivered)):
+                into.append(HiddenErrors(error, sigma, spread, *where))
+        # A map whose points err together would be called the model's error.
+        undone, aligned = sum(kept.share == 0 for kept in self._kept.values()), sum(k.alignment.ok for k in keyframes)
+        against = f"{undone} of {aligned} bends to the map's points had to be undone" if 2 * undone > aligned else ""
+        return Doubts(tuple(predicted), tuple(delivered), against) if predicted else None
+
+    def _share(self, k: AlignedKeyframe) -> float:
+        """Share of its bend that a keyframe was delivered with."""
+        kept = self._kept.get(k.keyframe.name)
+        return 0.0 if k.alignment.bend is None else 1.0 if kept is None else kept.share
 
     def _tried(self, k: AlignedKeyframe) -> Tried:
         bend, alone, told = k.alignment.bend, k.alone, self._told.get(k.keyframe.name)
         assert bend is not None and alone is not None
-        by_images = np.zeros((0, 2))
+        by_images = np.zeros((0, len(SHARES)))
         if told is not None and len(told.deciding):
             o = told.deciding
-            guesses = o.predicted * np.exp(bend.at(o.pixels, o.predicted)), o.predicted * alone.scale
-            by_images = np.abs(np.stack(guesses, 1) / o.mapped[:, None] - 1)
+            level = np.log(alone.scale)
+            field = level + np.outer(bend.at(o.pixels, o.predicted) - level, SHARES)
+            by_images = field + np.log(o.predicted / o.mapped)[:, None]
         blocks = self._blocks.get(k.keyframe.name, np.zeros((0, 4)))
-        return Tried(by_images, blocks[:, [1, 0]], _size(bend))
+        return Tried(by_images, blocks[:, :2], _size(bend))
 
-    def _at_one_scale(self, k: AlignedKeyframe) -> AlignedKeyframe:
-        assert k.alone is not None and k.view is not None
-        alignment = replace(k.alone, unbent_because=self._undone[k.keyframe.name])
-        level = unbent(replace(k.view, scale=k.alone.scale), self._config.bending)
+    def _lessened(self, k: AlignedKeyframe) -> AlignedKeyframe:
+        """With the share of its bend that it keeps, or one scale where points distrust even that."""
+        kept, alone, whole = self._kept[k.keyframe.name], k.alone, k.alignment.bend
+        if kept.share == 1:
+            return k
+        assert alone is not None and whole is not None and k.view is not None
+        if kept.share > 0:
+            part = replace(whole, weights=kept.share * whole.weights)
+            part.weights[0] += (1 - kept.share) * np.log(alone.scale)
+            alignment = bent(alone, part, k.view.observed, self._config.alignment)
+            if alignment.bend is not None:
+                return replace(k, alignment=replace(alignment, unbent_because=kept.reason), bend=part)
+        alignment = replace(alone, unbent_because=kept.reason)
+        level = unbent(replace(k.view, scale=alone.scale), self._config.bending)
         return replace(k, alignment=alignment, bend=level)
 
 

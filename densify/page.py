@@ -29,7 +29,8 @@ from lightdepth.reporting.figures import (
 from lightdepth.reporting.report import Report, number
 from lightdepth.sparse_map import SparseMap, Submap
 
-SEEN_WELL, SEEN_WEAKLY = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15)
+SEEN_WELL, SEEN_WEAKLY, DOUBTFUL = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15), (0.8, 0.15, 0.15)
+_TRUSTED = 0.2  # confidence below which wall is red: it is expected to be off by twice what is doubted
 
 
 class Gallery:
@@ -152,7 +153,8 @@ def _errors(page: Report, figures: Sequence[MapFigures]) -> None:
 def _coverage(page: Report, results: Sequence[SubmapResult], mm_per_unit: float | None) -> None:
     page.heading("Coverage")
     page.text(
-        "Which part of the wall was seen well: by enough keyframes, not too slanted, neither clipped nor in the dark. "
+        "Which part of the wall was seen well: by enough keyframes, not too slanted, neither clipped nor in the dark, "
+        "and near enough for the map to hold it: far wall is wrong in all keyframes alike, however many saw it. "
         "Holes are wall that nothing saw, with surface around them; the open ends of a piece of tube are none. "
         "The frame is the one to look at again."
     )
@@ -210,9 +212,10 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
         if j.surface is not None:
             met = "" if j.surface.median_met is None else f" {100 * j.surface.median_met:.1f} % in the median;"
             text += f" The surface against the images:{met} {100 * j.surface.miss:.0f} % of their rays miss it."
-        undone = [a for a in result.dense.alignments if a.unbent_because]
-        if undone:
-            text += f" {len(undone)} keyframes keep one scale; {undone[0].keyframe}: {undone[0].unbent_because}."
+        braked = [a for a in result.dense.alignments if a.unbent_because]
+        if braked:
+            text += f" {j.undone} keyframes keep one scale, {j.lessened} a part of their bend; "
+            text += f"{braked[0].keyframe}: {braked[0].unbent_because}."
         page.text(text)
 
 
@@ -240,11 +243,13 @@ def mesh_pictures(dense: DenseMap, name: str = "") -> list[tuple[bytes, str]]:
     middle = keyframes[len(keyframes) // 2]
     inside = mesh_picture(*surface, origin=middle.center, axes=middle.cam_from_map[:3, :3])
     pictures.append((png(inside), f"… and from keyframe {middle.name}"))
-    if dense.weights is not None:
-        colors = np.where(seen_well(dense)[:, None], SEEN_WELL, SEEN_WEAKLY)
-        pictures.append(
-            (png(mesh_picture(dense.vertices, dense.triangles, colors)), "Seen well (green), weakly (orange)")
-        )
+    if dense.weights is not None and dense.confidence is not None:
+        weak = np.where(dense.confidence[:, None] < _TRUSTED, DOUBTFUL, SEEN_WEAKLY)
+        colors = np.where(seen_well(dense)[:, None], SEEN_WELL, weak)
+        seen = (dense.vertices, dense.triangles, colors)
+        inside = mesh_picture(*seen, origin=middle.center, axes=middle.cam_from_map[:3, :3])
+        text = f"Seen well (green), weakly (orange), or of a confidence below {_TRUSTED} (red)"
+        pictures += [(png(mesh_picture(*seen)), text), (png(inside), f"… and from keyframe {middle.name}")]
     return pictures
 
 

@@ -84,7 +84,7 @@ def densify_submap(
         with clock("align"):
             keyframes.append(align_alone(keyframe, submap, seen, config.alignment))
         with clock("judge"):
-            judge.see(keyframe, seen)
+            judge.see(keyframes[-1], seen)
     if config.recipe == "full":
         with clock("agree"):
             keyframes = align_together(keyframes, shared, config)

@@ -37,17 +37,22 @@ class LightDepth(pl.LightningModule):
 
     Args:
         network: Which network is trained.
-        loss: Weights of the loss terms, and the constants inside them.
-        learning_rate: Rate of AdamW at the top of the schedule, a number above 0. A higher one learns faster, and
-            less steadily.
-        weight_decay: Weight decay of AdamW, a share per step of the rate. A larger one keeps the network's weights
-            smaller.
-        schedule: How the rate changes over the run: one_cycle (up, then down), cosine (down) or constant.
+        loss: Weights of the loss terms (factors without a unit, times each term's mean over the pixels), and the
+            constants inside them.
+        learning_rate: Learning rate of the optimiser AdamW at the top of the schedule, a number above 0. A larger one
+            changes the weights more in every step: the network learns faster, and less steadily.
+        weight_decay: Weight decay of AdamW: every step shrinks each weight by this number times the learning rate, as a
+            share; 0 for none. A larger one keeps the weights smaller.
+        schedule: How the learning rate goes over the run: one_cycle climbs to learning_rate and falls to nearly 0;
+            cosine falls from learning_rate to 0; constant stays at learning_rate.
         rows: Height of the images that the network is trained at, pixels; predictions are made at it. A larger one
             shows finer detail and takes longer.
-        pretrained: File of weights that others trained, for the encoder of unet or dpt (.safetensors or .pth).
-        start: Checkpoint of ours to start from, by name or path, where its network has the same parts.
-        freeze_distance: Whether only the uncertainty head learns; distance and albedo stay as they start.
+        pretrained: File of weights that others trained (.safetensors or .pth), which the encoder of a unet or dpt
+            network starts from; tiny takes none. Left out, the encoder starts from random weights.
+        start: Checkpoint of lightdepth that all weights start from: a path, or a bundled name such as lightdepth-self.
+            Its network must have the same kind, inputs, encoder and width. Left out, weights start at random.
+        freeze_distance: true: only the uncertainty head learns (it needs model.network.uncertainty), and distance and
+            albedo stay those of --model.start. false: the whole network learns.
     """
 
     def __init__(

@@ -9,7 +9,8 @@ score of s_k; the best one, to a part of a step by a parabola, is the distance (
 speaks only where the best score is high, no other hypothesis comes near it, and it falls off to both sides: without
 texture, or without parallax, it does not.
 
-The guess decides where is looked, and how a patch is slanted; not what is found. The poses are taken as they are: one
+The guess is the map's: the median distance of the points that the keyframe observed nearby. So what is judged has no
+part in where is looked. It decides how a patch is slanted too; not what is found. The poses are taken as they are: one
 factor on all of them, or a slow drift of it, cannot be seen.
 """
 
@@ -20,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel
@@ -28,6 +30,7 @@ from lightdepth.observations import ObservedDistances, sample_distance
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Keyframe, Submap
 
+_GRID, _NEAREST = 24, 7
 _SATURATED = 0.97  # of the brightest value: highlights wander with the camera
 _BESIDE = 2.0  # pixels from the middle of a patch to the places that tell its slant
 
@@ -37,24 +40,27 @@ class ParallaxConfig:
     """How the images measure distance."""
 
     on: bool = True
-    """Whether distances measured between images judge the surface; switched off, only the map's points do."""
+    """Whether distances measured between the images of keyframes (by parallax) help to judge bends and surface;
+    switched off, only the map's points do."""
     width: int = 320
-    """Width that images are compared at, pixels; smaller ones stay. A larger one measures finer and takes longer."""
+    """Width to which wider images are shrunk before they are compared, pixels. A larger one measures finer and takes
+    longer."""
     across: int = 24
-    """Number of cells across the image, of each of which the pixel with most texture is tried. More give more
-    distances and take longer."""
+    """Number of cells across the image, and in proportion down; in each, the pixel with most texture is measured. More
+    give more distances and take longer."""
     neighbours: int = 4
-    """Number of keyframes that each is compared with. More make distances surer and take longer."""
+    """Largest number of other keyframes that each is compared with. More make distances surer and take longer."""
     patch: int = 7
-    """Side of the patches that are compared, pixels, an odd number. A larger one needs less texture and blurs edges."""
+    """Side of the square patches of image that are compared, pixels, an odd number. A larger one needs less texture and
+    blurs edges."""
     angle: float = 12.0
-    """Parallax that neighbours are chosen for, degrees between their rays to shared points. A larger one measures
-    finer, between images that look less alike."""
+    """Parallax preferred in the choice of those keyframes, degrees: the angle between both cameras' rays to a shared
+    point. A larger one measures distance more finely, between images that look less alike."""
     least_angle: float = 2.0
-    """Parallax below which a neighbour is not compared, degrees. A larger one leaves out more pairs."""
+    """Parallax below which two keyframes are not compared, degrees. A larger one leaves out more pairs."""
     least_score: float = 0.7
-    """Least correlation of a patch with its likeness, 1 at most, for its distance to count. A larger one gives fewer,
-    surer distances."""
+    """Least correlation, at most 1, of a patch with what the other keyframes show of it, for its distance to count. A
+    larger one gives fewer, surer distances."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -129,17 +135,36 @@ def parallax_neighbours(submap: Submap, config: ParallaxConfig) -> list[list[int
     return found
 
 
+def guessed(keyframe: Keyframe, submap: Submap) -> np.ndarray:
+    """Distance (h, w), map units, about every pixel of a keyframe by the map alone: the median of the points observed
+    nearest to it, coarsely. NaN where the keyframe observed too few."""
+    camera = keyframe.camera
+    points = keyframe.in_camera(submap.observed_points(keyframe)[1])
+    at, seen = camera.project(points)
+    at, distance = at[seen], np.linalg.norm(points[seen], axis=1)
+    if len(distance) < _NEAREST:
+        return np.full((camera.height, camera.width), np.nan)
+    rows, columns = max(2, round(_GRID * camera.height / camera.width)), _GRID
+    size = np.array([camera.width, camera.height])
+    grid = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), -1).reshape(-1, 2) / (columns, rows)
+    nearest = cKDTree(at).query(grid * size, k=_NEAREST)[1]
+    coarse = np.median(np.log(distance[nearest]), 1).reshape(rows, columns).astype(np.float32)
+    smooth = cv2.resize(cv2.GaussianBlur(coarse, (0, 0), 1.0), (camera.width, camera.height))
+    result: np.ndarray = np.exp(smooth)
+    return result
+
+
 def measured(
-    look: Look, others: Sequence[Look], prediction: DepthPrediction, scale: float, config: ParallaxConfig
+    look: Look, others: Sequence[Look], guess: np.ndarray, prediction: DepthPrediction, config: ParallaxConfig
 ) -> ObservedDistances:
-    """Distances by parallax, as if they were points of the map: `mapped` is what the images say, `predicted` what the
-    prediction, of the look's size, says; `scale` times that is the guess. `pixels` (n, 2) are in [0, 1]², over the
-    image's size. Empty where no pixel speaks. `point_ids` number the pixels that were tried.
+    """Distances by parallax, as if they were points of the map: `mapped` is what the images say, within a factor of
+    1.8 of the guess (h, w), map units; `predicted` is what the prediction says. All are of the look's size. `pixels`
+    (n, 2) are in [0, 1]², over the image's size. Empty where no pixel speaks. `point_ids` number those that were tried.
     """
     pixels = textured(look, config)
-    if not others or not len(pixels):
+    if not others or not len(pixels) or not np.isfinite(guess).any():
         return _none(0)
-    sweep = _Sweep.of(look, pixels, prediction, scale, config.patch)
+    sweep = _Sweep.of(look, pixels, guess, config.patch)
     total, count = np.zeros(sweep.shape), np.zeros(sweep.shape)
     for other in others:
         score, seen = sweep.compared(look, other)
@@ -148,10 +173,10 @@ def measured(
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(count > 0, total / count, -1.0)
     step, speaks = _best(mean, config.least_score)
-    speaks &= sweep.known
+    predicted, valid = sample_distance(prediction, pixels)
+    speaks &= sweep.known & valid
     camera, at = look.keyframe.camera, pixels[speaks]
-    mapped = np.exp(sweep.guess[speaks] + step[speaks])
-    predicted = np.exp(sweep.guess[speaks]) / scale
+    mapped, predicted = np.exp(sweep.guess[speaks] + step[speaks]), predicted[speaks]
     x = at / (camera.width, camera.height)
     return ObservedDistances(np.flatnonzero(speaks), mapped, predicted, x, camera.unproject(at)[0])
 
@@ -181,13 +206,12 @@ class _Sweep:
         return len(self.guess), len(_HYPOTHESES)
 
     @classmethod
-    def of(cls, look: Look, pixels: np.ndarray, prediction: DepthPrediction, scale: float, patch: int) -> _Sweep:
+    def of(cls, look: Look, pixels: np.ndarray, guess: np.ndarray, patch: int) -> _Sweep:
         camera: CameraModel = look.keyframe.camera
         three = (pixels[:, None] + np.array([[0, 0], [_BESIDE, 0], [0, _BESIDE]])).reshape(-1, 2)
-        distance, valid = sample_distance(prediction, three)
+        distance = _sampled(guess.astype(np.float32), three[None])[0].astype(float).reshape(-1, 3)
         rays, inside = camera.unproject(three)
-        distance = scale * distance.reshape(-1, 3)
-        known = (valid & inside).reshape(-1, 3).all(1) & (distance > 0).all(1)
+        known = inside.reshape(-1, 3).all(1) & (distance > 0).all(1)
         distance = np.where(known[:, None], distance, 1.0)
         places = rays.reshape(-1, 1, 3, 3) * (distance[:, None] * np.exp(_HYPOTHESES)[:, None])[..., None]
         half = patch // 2

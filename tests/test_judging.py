@@ -11,7 +11,7 @@ from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
 from densify.densified import Densified
 from densify.fusion.volume import FusionConfig
-from densify.judging.brake import Tried, undone
+from densify.judging.brake import Tried, kept
 from densify.judging.columns import Columns
 from densify.judging.config import JudgeConfig
 from densify.judging.verdict import Judgement, Verdict, proposal, worst
@@ -129,33 +129,43 @@ def test_fewer_than_two_folds_are_refused():
         JudgeConfig(folds=1)
 
 
-def some(count: int, bent: float, scaled: float) -> np.ndarray:
-    return np.tile([bent, scaled], (count, 1)).astype(float)
+def some(count: int, *errors: float) -> np.ndarray:
+    return np.tile(errors, (count, 1)).astype(float)
 
 
-NONE = np.zeros((0, 2))
+NONE = np.zeros((0, 3))
 
 
-def test_a_bend_that_the_images_speak_against_is_undone_and_others_stay():
-    tried = {"bad": Tried(some(80, 0.2, 0.05), NONE, 0.5), "good": Tried(some(80, 0.03, 0.1), NONE, 0.5)}
-    found = undone(tried)
-    assert set(found) == {"bad"} and "by the images" in found["bad"]
+def test_a_keyframe_keeps_what_the_images_speak_for_of_its_bend():
+    tried = {
+        "none": Tried(some(900, 0.05, 0.1, 0.2), NONE, 0.5),
+        "half": Tried(some(900, 0.15, 0.03, 0.15), NONE, 0.5),
+        "all": Tried(some(900, 0.2, 0.1, 0.03), NONE, 0.5),
+    }
+    found = kept(tried)
+    assert {name: k.share for name, k in found.items()} == {"none": 0.0, "half": 0.5, "all": 1.0}
+    assert "by the images" in found["none"].reason and found["all"].reason == ""
+
+
+def test_where_the_images_can_hardly_tell_less_is_bent():
+    noise = np.random.default_rng(0).normal(0, 0.1, (300, 3)) * (1, 1, 0.99)
+    assert kept({"a": Tried(noise, NONE, 0.5)})["a"].share == 0
 
 
 def test_where_the_images_are_silent_hidden_blocks_decide_and_a_bend_beyond_its_prior_goes():
     tried = {
-        "better": Tried(NONE, some(90, 0.03, 0.1), 0.8),
-        "worse": Tried(NONE, some(90, 0.2, 0.1), 0.8),
-        "large": Tried(NONE, some(90, 0.03, 0.1), 2.6),
+        "better": Tried(NONE, some(900, 0.1, 0.03), 0.8),
+        "worse": Tried(NONE, some(900, 0.1, 0.2), 0.8),
+        "large": Tried(NONE, some(900, 0.1, 0.03), 2.6),
     }
-    found = undone(tried)
-    assert set(found) == {"worse", "large"}
-    assert "hidden blocks" in found["worse"] and "2.6 times" in found["large"]
+    found = kept(tried)
+    assert {name: k.share for name, k in found.items()} == {"better": 1.0, "worse": 0.0, "large": 0.0}
+    assert "hidden blocks" in found["worse"].reason and "2.6 times" in found["large"].reason
 
 
 def test_a_bend_that_nothing_can_judge_is_undone():
-    assert set(undone({"a": Tried(NONE, NONE, 0.1)})) == {"a"}
-    assert undone({}) == {}
+    assert kept({"a": Tried(NONE, NONE[:, :2], 0.1)})["a"].share == 0
+    assert kept({}) == {}
 
 
 def known(**changes) -> Judgement:

@@ -119,6 +119,7 @@ def test_the_verb_writes_surfaces_timings_and_what_they_say(data, tmp_path, caps
     assert {
         "timings.csv",
         "timings.png",
+        "report.html",
         "run.json",
         "config.yaml",
         "map_000/mesh.ply",
@@ -128,7 +129,12 @@ def test_the_verb_writes_surfaces_timings_and_what_they_say(data, tmp_path, caps
     assert record["timings"]["share_in_budget"] == 1 and record["timings"]["keyframes"] == 7
     assert set(record["timings"]["steps"]) == {"read", *STEPS}
     assert all(0 <= m["coverage"]["well_share"] <= 1 < m["coverage"]["area"] for m in record["maps"])
-    assert "100% of 7 keyframes within 1e+06 ms" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "100% of 7 keyframes within 1e+06 ms" in told and f"verdict: {record['verdict']['colour']}" in told
+    counts = [m["ahead"]["new_points"]["count"] for m in record["maps"]]
+    rows = list(csv.DictReader((run / "timings.csv").open()))
+    assert sum(counts) == sum(int(r["new_points"]) for r in rows) > 0
+    assert "Agreement with the map ahead" in (run / "report.html").read_text()
 
 
 def test_the_verb_names_lost_frames_and_refuses_settings_that_are_none(data, tmp_path):

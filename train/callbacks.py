@@ -96,14 +96,14 @@ class DiagnosisConfig:
     """When a run that goes nowhere is stopped."""
 
     patience: int = 10
-    """Number of batches in a row with a loss or gradient that is no number, which are skipped, until the run is
-    stopped. More wait longer."""
+    """Number of steps in a row whose loss or gradient is infinite or not a number, after which the run is stopped with
+    an error; until then such steps are skipped. More wait longer."""
     blind: int = 50
-    """Number of batches in a row without a usable pixel (all black or saturated) until the run is stopped. More wait
-    longer."""
+    """Number of batches in a row in which every pixel is black, saturated or masked, after which the run is stopped
+    with an error. More wait longer."""
     constant: int = 200
-    """Number of batches in a row in which distance is as good as constant although brightness is not, until the run
-    is stopped. More wait longer."""
+    """Number of batches in a row in which the network gives nearly one distance everywhere although brightness varies,
+    after which the run is stopped with an error. More wait longer."""
 
 
 class Diagnosis(pl.Callback):

@@ -18,32 +18,42 @@ class TubeData:
     """Synthetic colons for training, drawn from the data's seed; validation scenes are others."""
 
     scenes: int = 0
-    """Number of colons to train on, each with its own shape, texture and endoscope; 0 for none. More make a network
-    that knows more, and take longer to render."""
+    """Number of synthetic colons to train on, each with its own shape, texture and endoscope; 0 for none. More show the
+    network more variety, and take longer to render."""
     val_scenes: int = 0
-    """Number of colons to validate on, others than those of the training. More judge more surely and take longer."""
+    """Number of synthetic colons to validate on, others than those to train on; 0 for none. More judge more surely and
+    take longer."""
     frames: int = 8
-    """Number of frames of each colon. More take longer to render."""
+    """Number of frames rendered of each colon, to train and to validate on. More show more of each colon and take
+    longer to render."""
     travel: float = 60.0
-    """Length of colon over which the frames are spread, mm. A longer one makes neighbouring frames less alike."""
+    """Length of the endoscope's way through each colon, mm, over which its frames are spread evenly. A longer one makes
+    neighbouring frames less alike."""
     lenses: tuple[Lens, ...] = ("c3vd", "fisheye", "pinhole")
-    """Lenses that the colons have in turn: c3vd, fisheye, pinhole or telescope."""
+    """Lenses that the colons get in turn, a list: pinhole (90 degrees wide, no distortion), telescope (70 degrees, no
+    distortion), fisheye (136 degrees), c3vd (that of the data set C3VD). Each lens that is left out is one that the
+    network never sees."""
     mu: tuple[float, float] = (0.0, 3.5)
-    """Ends of the range of the exponent mu of the light's spread. A larger one makes a narrower light."""
+    """Range [low, high] from which each colon's exponent mu is drawn: light falls off by exp(-mu (1 - cos a)) at the
+    angle a from its axis, and at 0 not at all. A larger one makes a narrower light, with darker borders of the
+    image."""
     gamma: tuple[float, float] = (1.8, 2.6)
-    """Ends of the range of the exponent gamma of the camera's response. A larger one brightens dark parts more."""
+    """Range [low, high] from which each colon's exponent gamma is drawn: the camera writes the light v as v^(1/gamma),
+    and 1 is linear. A larger one brightens dark parts more."""
     reflectance: tuple[float, float] = (0.0, 0.7)
-    """Ends of the range of the share of light that the wall throws back on other wall. A larger one makes more
-    indirect light."""
+    """Range [low, high] from which each colon's reflectance is drawn, the share of light, in [0, 1), that its wall
+    throws back onto other wall. A larger one makes more indirect light."""
     family: Literal["plain", "realistic", "mixed"] = "plain"
-    """Kind of colons: plain; realistic, with polyps, mucus, motion blur and all else (lightdepth.tube.realistic); or
-    mixed, where one scene of five is no colon but a hollow looked at from anywhere (lightdepth.tube.cavity), and
-    every scene has a field of view of its own."""
+    """Kind of colons: plain, tubes with folds under the endoscope's light; realistic, with polyps, mucus, motion blur
+    and whatever else real images have; mixed, as realistic, but one scene of five is a hollow of any form instead, and
+    each has a round or eight-sided field of view of its own."""
     scene: TubeConfig | None = None
-    """Ranges of one's own instead of the family's; mu, gamma and reflectance above hold in any case."""
+    """Ranges that the colons are drawn from, in place of those of the family: a mapping in a --config file, or
+    --data.tube.scene.shape.length 150 and the like, named as below --scene in `lightdepth synth --help-all`. mu, gamma
+    and reflectance above hold all the same. Left out, the family's."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where colons are rendered: cpu, cuda, or auto, the GPU where there is one and the extra gpu is installed. The
-    colons are the same on any, up to rounding."""
+    """Where colons are rendered: cpu; cuda, the GPU, which needs the extra gpu; auto, the GPU where there are both,
+    else the CPU. It changes the time, not the colons (up to rounding)."""
 
 
 _MAX_REFLECTANCE = 0.95

@@ -35,50 +35,64 @@ class FrameData:
     """Which frames are trained and validated on, and how they are shown to the network."""
 
     sequences: list[str] | None = None
-    """Folders of frames, or videos, to train on."""
+    """Folders of frames, or videos, to train on. Left out, --data.split or synthetic colons (--data.tube.scenes) have
+    to be there."""
     val_sequences: list[str] | None = None
-    """Folders to validate on; without any, the end of each training sequence is held out."""
+    """Folders of frames, or videos, to validate on: they teach nothing, and choose the best checkpoint. Left out, the
+    end of each training sequence does that (--data.held_out)."""
     split: str | None = None
-    """Split file (data/*/splits/*.yaml) in place of both; its train and val are read, its test never is."""
+    """YAML file that says which sequences train and which validate (data/*/splits/*.yaml); its test sequences are never
+    read. It takes the place of --data.sequences and --data.val_sequences, and needs --data.root."""
     root: str | None = None
-    """Folder that holds the sequences of the split."""
+    """Folder in which the sequences that --data.split names are looked for; given with it, and only with it."""
     frames: str | None = None
-    """File with one frame name a line, as `select` writes it; training takes exactly these, and what is held out to
-    validate on comes from them. `folder/name` where several sequences have frames of one name."""
+    """Text file with one frame name a line, as `lightdepth select` writes it: of the training sequences only these
+    frames are used, those held out to validate on included. A line is `folder/name` where several sequences have frames
+    of one name. Left out, all frames are used."""
     format: FormatName | None = None
-    """Format of the sequences: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by looking
-    if left out."""
+    """Format of all the sequences: folder (images with camera.json), video, or the data set c3vd, simcol, hamlyn,
+    scared, endoslam or endomapper. Left out, each is told by its files."""
     camera: str | None = None
-    """Calibration file of all the sequences, which wins over their own."""
+    """Calibration file of the camera, for all the sequences in place of their own. Left out, each has its own."""
     light: str | None = None
-    """Light of all the sequences, which wins over their own: light.json, photometric XML, or gamma=2.2,mu=0."""
+    """Light of the endoscope, for all the sequences in place of their own: a light.json, a photometric XML, or values
+    such as gamma=2.2,mu=0 (response and spread). Left out, each has its own, or an assumed one."""
     mask: str | None = None
-    """Image, white where tissue shows, for all the sequences; it wins over their own."""
+    """Image, white where tissue shows and black elsewhere, for all the sequences in place of their own masks. Left out,
+    each has its own, if any."""
     bit_depth: int | None = None
     """Bits of a sample in pictures that are stored in more than 8, of all the sequences; left out, what the files say,
     else what their highest values show. A larger one reads the same numbers as darker."""
     held_out: float = 0.1
-    """Share of each training sequence, at its end, to validate on where there are no validation sequences. A larger
-    one judges more surely and trains on less."""
+    """Share of each training sequence, above 0 and below 1, at its end, that validates and teaches nothing, where no
+    validation sequences are given. A larger one judges more surely and trains on less."""
     tube: TubeData = _NO_TUBE
     """Synthetic colons to train and validate on, besides the sequences or alone."""
     halves: bool = False
-    """Whether every batch holds frames of the sequences first, then as many (or one less) of the synthetic colons."""
+    """true: one half of each batch is frames of the sequences, the other of synthetic colons (of an odd number the
+    sequences have one more). false: all are shuffled together, so that there are most of what has most frames. Without
+    both kinds it changes nothing."""
     size: tuple[int, int] = (160, 128)
-    """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
+    """Width and height that the images are resized to, pixels, to train, validate and predict at. A larger one shows
+    finer detail and takes longer."""
     batch_size: int = 4
-    """Number of frames in a step. More make steadier steps and take more time and memory."""
+    """Number of frames in a batch, from which the network learns at once. More make steadier steps and take more time
+    and memory."""
     num_workers: int = 0
-    """Number of processes that read frames; 0 reads them in the main one. More read faster, as far as there are
-    cores."""
+    """Number of extra processes that read frames; with 0 the main one reads them itself, between steps. More read
+    faster, as far as there are cores."""
     augment: bool = True
-    """Whether exposure is varied and images are flipped at random."""
+    """true: training images are flipped at random, and made brighter or darker by some 10 %. false: they are shown as
+    they are. Validation images are never changed."""
     reflectance_error: float = 0.0
-    """Added to each wall's known reflectance, itself a share up to 0.95: 0.3 takes 0.4 for 0.7. It shows what a wrong
-    calibration costs, to the loss only with --model.loss.reflectance null. A larger one makes it more wrong."""
+    """Number added to the known reflectance of each image (the share of light that the wall throws back; the sum is
+    kept in [0, 0.95]), to try what a wrong calibration costs; 0 adds nothing. A larger one makes it more wrong. Only
+    --model.loss.reflectance null, or reflectance among --model.network.inputs, lets it have an effect."""
     random_reflectance: tuple[float, float] | None = None
-    """Ends of a range, shares in [0, 1), from which each image's reflectance is drawn anew at every step, whatever is
-    known of it: for networks that have it as an input and are to obey it. A larger one means more indirect light."""
+    """Range [low, high] of shares in [0, 1), from which the reflectance told of each training image (the share of light
+    that the wall throws back) is drawn anew in every step; left out, the known one is told. A larger one tells of more
+    indirect light. Like reflectance_error, it acts through --model.loss.reflectance null or the network's input
+    alone."""
     seed: int = 0
     """Number that draws colons, order and augmentation. Another one makes another run."""
 

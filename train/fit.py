@@ -57,14 +57,15 @@ class FitConfig:
     """How a run is watched, averaged and stopped."""
 
     ema: float = 0.0
-    """Decay of the running average of the weights, a share in [0, 1), which is then what is validated and exported; 0
-    for none. A larger one averages over more steps."""
+    """Decay of the running average of the weights, in [0, 1), which is validated and exported in place of the last
+    weights; 0 takes no average. A larger one averages over more steps, about 1 / (1 - decay) of them."""
     monitor: Literal["loss", "photometric", "inconsistency", "last"] = "loss"
-    """What `best` and early stopping go by, on the validation frames; it needs no truth: the whole "loss", its
-    "photometric" term, or the "inconsistency", how much distance changes in a mirror and in less light; "last"
-    chooses nothing."""
+    """What must be least, on the validation frames, in the checkpoint that is exported; it needs no truth: the whole
+    "loss"; its "photometric" term (rendered against seen light); or the "inconsistency" (how much distance changes when
+    the image is mirrored and darkened). "last" exports the last step, whatever these say."""
     patience: int = 0
-    """Number of validations without improvement after which the run ends; 0 for never. More wait longer."""
+    """Number of validations in a row without a better value of --fit.monitor after which the run ends; 0 goes on to the
+    last step. More wait longer."""
     diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
     """When a run that goes nowhere is stopped."""
 

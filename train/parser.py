@@ -23,6 +23,13 @@ TRAINER_DEFAULTS = {
     "trainer.enable_model_summary": False,
 }
 
+_OUTPUT = "Folder of the run to make: checkpoints, model.safetensors, logs and run.json."
+_RESUME = """Go on with the run in OUTPUT from its checkpoints/last.ckpt, with its own config.yaml where no other is
+given. Without it, a folder that holds a run is refused."""
+_OVERWRITE = "Replace the run in OUTPUT by a new one. Without it, a folder that holds a run is refused."
+_SEED = """Number that all chance follows from: first weights, synthetic colons, order of frames and augmentation.
+Another one makes another run, better or worse by chance alone."""
+
 
 def training_parser() -> Parser:
     """Every option of a training run: of the model, its data, how it is watched, and Lightning's Trainer."""
@@ -39,11 +46,10 @@ def training_parser() -> Parser:
     parser = Parser(prog="lightdepth train", description=summary, allow_abbrev=False)
     parser.add_argument("--config", action="config")
     parser.add_argument("--preset", metavar="NAME", help=preset_help("train"))
-    parser.add_argument("-o", "--output", required=True, help="Folder of the run, with its checkpoints and its model.")
-    parser.add_argument("--resume", action="store_true", help="Go on from the run's own checkpoints/last.ckpt.")
-    parser.add_argument("--overwrite", action="store_true", help="Replace a run that is already there.")
-    seed = "Number that draws weights, colons, order and augmentation. Another one makes another run."
-    parser.add_argument("--seed", type=int, default=0, help=seed)
+    parser.add_argument("-o", "--output", required=True, help=_OUTPUT)
+    parser.add_argument("--resume", action="store_true", help=_RESUME)
+    parser.add_argument("--overwrite", action="store_true", help=_OVERWRITE)
+    parser.add_argument("--seed", type=int, default=0, help=_SEED)
     parser.add_class_arguments(LightDepth, "model")
     parser.add_class_arguments(FrameData, "data")
     parser.add_class_arguments(FitConfig, "fit")
@@ -54,7 +60,8 @@ def training_parser() -> Parser:
     for action in parser._actions:
         action.help = TRAINER_OPTIONS.get(action.dest, action.help)
     assert parser.groups is not None
-    parser.groups["trainer"].title = "Lightning's Trainer"
+    parser.groups["model"].title = "How the network learns, and from which weights"
+    parser.groups["trainer"].title = "Lightning's Trainer: device, length of the run, and what is logged"
     finish(parser, PAGES["train"])
     return parser
 

@@ -22,7 +22,6 @@ from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import JudgedMap
 from densify.evaluation.records import SurfaceFigures
 from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
-from densify.judging.config import JudgeConfig
 from densify.pipeline import densify
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.errors import InputError
@@ -61,7 +60,7 @@ class BenchConfig:
     the last model with one scale a keyframe and in full. More cases take longer."""
     image_size: tuple[int, int] = IMAGE_SIZE["small"]
     """Width and height of the keyframes, pixels. A larger one takes longer."""
-    densify: DensifyConfig = field(default_factory=lambda: DensifyConfig(judge=JudgeConfig(on=False)))
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
     """How dense maps are made, for all dense rows but for their recipe."""
 
     def __post_init__(self) -> None:

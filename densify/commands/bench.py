@@ -23,7 +23,6 @@ from densify.bench.scenes import Size, scenes
 from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, CellFigures, load_models, predicted, run_scene
 from densify.config import DensifyConfig, OfflineConfig, Recipe
-from densify.judging.config import JudgeConfig
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
@@ -59,16 +58,23 @@ def run(
 
     Args:
         output: Folder to make, with bench.json and bench.md.
-        size: How much is measured: small, two short sequences, minutes; full, eight and a screening, up to an hour.
-        first_seed: Number that seeds the first scene; the others count on from it. Seeds below 1000 were never
-            trained on. Another one draws other colons.
-        wrong_shares: Shares of wrong map points, each a SLAM export of its own (the screening always has 0.3); left
-            out, those of the size. More shares take longer.
-        checkpoints: Depth models to compare: paths, names of bundled ones, decline (the closed form) or constant.
-        recipes: Ways to make surfaces that are compared: full, paper, or both.
-        cases: Map errors that come together, each judged with one scale a keyframe and in full: clean, side, wide side,
-            drift, fold, poses; left out, those of the size. More cases take longer.
-        image_size: Width and height of the keyframes, pixels; left out, that of the size. A larger one takes longer.
+        size: How much is measured: small, two short sequences, minutes; full, eight, and one ten times as long (the
+            screening), up to an hour.
+        first_seed: Number that seeds the first scene; the others count on from it. Bundled checkpoints were trained on
+            no seed below 1000. Another one draws other colons.
+        wrong_shares: Shares, in [0, 1), of wrong map points, each a map of its own (the screening always has 0.3); left
+            out, 0.1 and 0.45 (small), or 0, 0.1, 0.3 and 0.45 (full). More shares take longer, and larger ones are
+            harder.
+        checkpoints: Depth models to compare, each a row: path of a checkpoint, bundled name, decline (a formula from
+            how light fades, no network) or constant (all equally far).
+        recipes: Ways to make surfaces that are compared: full (all steps), paper (as published: one scale per keyframe,
+            plain TSDF), or both. Options of agreement, bending, contradiction and rectify count for full alone.
+        cases: Errors that map points share, each tried with one scale a keyframe and in full, by the last of
+            --checkpoints: clean (none), side (30 % of the points, on one side, 15 % too far), wide side (45 %, 30 %),
+            drift (of scale, 30 %), fold (20 % one fold too far), poses (a bent path). Left out, clean, wide side and
+            drift (small), or all (full). More cases take longer.
+        image_size: Width and height of the keyframes, pixels; left out, 160 by 128 (small) or 320 by 256 (full). A
+            larger one shows finer detail and takes longer.
         overwrite: Replace a run made before.
     """
     arguments = recorded(
@@ -90,7 +96,7 @@ def run(
         recipes=recipes,
         cases=USUAL_CASES[size] if cases is None else cases,
         image_size=image_size or IMAGE_SIZE[size],
-        densify=DensifyConfig(**vars(method), judge=JudgeConfig(on=False)),
+        densify=DensifyConfig(**vars(method)),
     )
     models = load_models(checkpoints)
     with run_folder(output, "bench", arguments, overwrite) as folder:
@@ -123,7 +129,8 @@ def compare_runs(a: Path, b: Path, output: Path | None = None, seed: int = 0) ->
         a: File bench.json of the first run, or its folder.
         b: File bench.json of the second run, or its folder.
         output: JSON file to write the comparison to, besides showing it.
-        seed: Number that draws the bootstrap samples. Another one gives slightly different intervals.
+        seed: Number that draws the bootstrap samples, by which noise is told from difference. Another one gives
+            slightly different intervals.
     """
     found = compare(read_bench(a), read_bench(b), seed)
     print(found.markdown(str(a), str(b)))
@@ -144,9 +151,12 @@ def compare_estimators(
 
     Args:
         output: Folder to make, with estimators.json, .md and .png.
-        shares: Shares of wrong points, each judged on its own. More shares take longer.
-        points: Numbers of points per keyframe, each judged on its own. More numbers take longer.
-        draws: Number of keyframes drawn for each combination. More make the figures more certain and take longer.
+        shares: Shares, in [0, 1), of a keyframe's points that are wrong, each judged on its own. More shares take
+            longer, and larger ones are harder.
+        points: Numbers of points per keyframe, each at least 8 and judged on its own. More numbers take longer, and
+            larger ones make the scale easier to find.
+        draws: Number of keyframes drawn for each combination of share, points and kind of error. More make the figures
+            more certain and take longer.
         seed: Number that draws the keyframes and their points. Another one draws others.
         overwrite: Replace what an earlier run made there.
     """

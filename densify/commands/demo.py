@@ -36,13 +36,15 @@ def demo(
 
     Args:
         output: Run folder to make, with the data, the surfaces and the report.
-        checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
-        frames: Number of frames to render, .7 mm apart. More make a longer path and take longer.
-        seed: Number that draws the colon; no bundled checkpoint was trained on seeds below 1000. Another one draws
-            another colon.
+        checkpoint: Depth model: path of a checkpoint, name of a bundled one, decline (a formula from how light fades,
+            no network) or constant (all equally far, to compare with).
+        frames: Number of frames to render, 0.7 mm apart. More make a longer path and take longer.
+        seed: Number that draws the colon, its light, the path and the map's errors; bundled checkpoints were trained on
+            none below 1000. Another one draws another colon.
         size: Width and height of the images, pixels. A larger one shows finer detail and takes longer.
-        lens: Lens of the endoscope: pinhole, telescope, fisheye or c3vd.
-        spurious: Share of the map points that are wrong. A larger one makes the map harder to densify.
+        lens: Lens of the endoscope: pinhole (90 degrees across), telescope (70), fisheye (136) or c3vd (that of the
+            data set C3VD).
+        spurious: Share of the map points, in [0, 1), that are wrong. A larger one makes the map harder to densify.
         overwrite: Replace a run made before.
     """
     arguments = recorded(

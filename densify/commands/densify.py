@@ -36,13 +36,17 @@ def densify(
 
     Args:
         output: Run folder to make, with the surfaces and the report.
-        checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
+        checkpoint: Depth model: path of a checkpoint, name of a bundled one, decline (a formula from how light fades,
+            no network) or constant (all equally far, to compare with).
         sfm: how frames are mapped when there is no map
-        formats: Formats of the mesh files to write: ply, and glb and obj besides if wanted.
-        mm_per_unit: Millimetres per map unit, where known; lengths are then written in mm. A larger one makes a
-            larger surface.
-        fit_light: Where nobody gave the light, fit it on the map and use it if hidden blocks of wall agree.
-        merge: Join submaps that see the same tissue, and give each group one surface besides the single ones.
+        formats: Formats of the mesh files to write: ply, which must be among them, and besides it glb and obj if
+            wanted.
+        mm_per_unit: Millimetres per map unit, where known: lengths and surfaces are then written in mm, else in map
+            units. A larger one makes a larger surface.
+        fit_light: Where neither --light nor the folder gives the light, fit it on the map, and use it if depth by it
+            fits hidden blocks of wall better; switched off, a usual light is assumed.
+        merge: Join submaps that see the same tissue, and write one surface for each group besides the single ones;
+            switched off, submaps stay apart.
         merging: when two submaps are one
         overwrite: Replace a run made before.
     """

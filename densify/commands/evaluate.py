@@ -31,12 +31,15 @@ def evaluate(
         run: Folder made by densify or predict, one of its map folders (joined_000), a sparse map, or a trajectory
             (TUM).
         output: Folder for the metrics; left out, evaluation/ in the run.
-        join: JSON file with the Sim(3) between two submaps (first, second, scale, rotation, translation), to judge
-            their gap.
-        suite: YAML file naming the sequences below run and truth that stand in one table (configs/bench/c3vd.yaml).
-        checkpoint: Depth model that sparse maps are made dense with first: a path, a bundled name, or decline; the
-            surfaces are written.
-        trajectory: File with every localised frame of the maps, in place of their keyframes.
+        join: JSON file with the Sim(3) that takes one submap to another (first, second, scale, rotation, translation),
+            by which the gap between their surfaces is judged.
+        suite: YAML file naming the sequences, folders of these names in run and truth, that are judged into one table
+            (configs/bench/c3vd.yaml).
+        checkpoint: Depth model by which a sparse map is made dense first, as densify does by default: path of a
+            checkpoint, bundled name, decline or constant; the surfaces are written. Left out, its points alone are
+            judged.
+        trajectory: TUM file with the pose of every frame that the SLAM localised, judged in place of the keyframes'
+            poses.
         overwrite: Replace metrics made before (evaluation/ in a run is replaced without asking).
     """
     arguments = recorded(

@@ -34,15 +34,17 @@ def live(
 
     Args:
         output: Run folder to make, with the surfaces and the timings.
-        checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
-        rate: Number of keyframes per second that come whether or not the last is done; left out, each comes when the
-            last is done. More leave less time for each: late ones queue, none is dropped.
-        budget_ms: Time that a keyframe may take, from its image to the renewed surface, milliseconds. A larger one
-            counts more keyframes as in time.
+        checkpoint: Depth model: path of a checkpoint, name of a bundled one, decline (a formula from how light fades,
+            no network) or constant (all equally far, to compare with).
+        rate: Number of keyframes that arrive per second, whether or not the last is done; left out, each arrives when
+            the last is done. More leave less time for each: late ones queue, none is dropped.
+        budget_ms: Time within which a keyframe counts as in time, from its image to the renewed surface, milliseconds;
+            only the report uses it. A larger one counts more keyframes as in time.
         sfm: how frames are mapped when there is no map
-        mm_per_unit: Millimetres per map unit, where known; lengths are then written in mm. A larger one makes a
-            larger surface.
-        fit_light: Where nobody gave the light, fit it on the map before the clock starts.
+        mm_per_unit: Millimetres per map unit, where known: lengths and surfaces are then written in mm, else in map
+            units. A larger one makes a larger surface.
+        fit_light: Where neither --light nor the folder gives the light, fit it on the map before the clock starts, and
+            use it if depth by it fits hidden blocks of wall better; switched off, a usual light is assumed.
         overwrite: Replace a run made before.
     """
     check_unit(mm_per_unit)
@@ -67,7 +69,7 @@ def live(
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
         run.hash_inputs(**source.files, map=mapped.map)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
-        result = PlayedRun(run, config.coverage, mm_per_unit)
+        result = PlayedRun(run, config.coverage, mm_per_unit, config.judge.on)
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:
             played = play(frames, sparse_map, model, config, result.add, rate, lambda _: bar.advance())
         result.finish(played, model.name, rate, budget_ms)

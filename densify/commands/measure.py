@@ -27,17 +27,22 @@ def measure(
     """Lengths and areas on a surface of a densify run: between two places, around one, inside an outline of more.
 
     Args:
-        run: Run folder made by densify, or one of its map folders.
-        points: Places on the surface, [[x, y, z], ...], in its unit (mm or map units). More than two outline an area.
-        frame: Number of the keyframe that pixels are given in. Another one has other pixels.
-        pixels: Places as pixels of that keyframe, [[u, v], ...], first centre at (0.5, 0.5), instead of points. More
-            than two outline an area.
-        radius: Radius of the disc of wall around a single place, in the surface's unit (mm or map units). A larger
-            one measures more wall.
-        map: Number of the map; needed where the run has several. Another one is another surface.
-        mm_per_unit: Millimetres per unit of the surface, where the run did not know it. A larger one makes longer
-            lengths.
-        output: JSON file to write the lengths and areas to, besides showing them.
+        run: Run folder made by `lightdepth densify`, or one of its map folders.
+        points: Places on the surface, [[x, y, z], ...], in its own coordinates (mm where the run knew the scale, else
+            map units). One, with --radius, gives the area around it, and two give the length between them. More give
+            the area inside the outline whose corners they are.
+        frame: Number of the keyframe in which --pixels are given, as in its name. Another one shows other places in
+            these pixels.
+        pixels: Places as pixels of the keyframe --frame, [[u, v], ...], u to the right and v down, with the centre of
+            the first pixel at (0.5, 0.5); in place of --points. Two give the length between them. More give the area
+            inside the outline whose corners they are.
+        radius: Radius of the part of the wall around a single place, a straight distance, in mm where the run or
+            --mm_per_unit gives the scale, else map units. A larger one measures more wall.
+        map: Number of the map to measure on, as in the name of its folder; needed where the run has several. Another
+            one is another surface.
+        mm_per_unit: Millimetres that a unit of the surface stands for, where the run did not know it; lengths are then
+            in mm. A larger one makes them longer in proportion. It is refused where the surface is in mm already.
+        output: JSON file to write the lengths and areas to, besides showing them. Left out, they are shown only.
     """
     dense = chosen_map(read_run(run), map, run)
     unit = run_unit(run, mm_per_unit)

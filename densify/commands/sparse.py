@@ -38,10 +38,10 @@ def sparse(
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
             their highest values show. A larger one reads the same numbers as darker.
-        poses: Known poses, at which points are only triangulated: truth, those of the sequence, or a TUM file (world
-            from camera) whose times are frame numbers.
-        repair: Sparse map of the frames to make anew from its keyframes' images, beginning at its poses, in its frame
-            and scale.
+        poses: Known poses of the frames: truth (those of the sequence), or a TUM file (world from camera) whose times
+            are frame numbers; only points are then found. Left out, poses are found as well.
+        repair: Sparse map of the frames to make anew, by matching the images of its keyframes, beginning at its poses
+            and keeping its frame and scale; not with --poses. Left out, the map is made of all frames.
         sfm: how frames are mapped
         overwrite: Replace a folder made before.
     """

@@ -32,27 +32,26 @@ class RectifyConfig:
     """Which predicted pixels are handed to the fusion, how finely, and with what weight."""
 
     focal_px: float = 256.0
-    """Finest resolution that is fused, pixels per radian; finer images are merged block by block. A larger one keeps
-    more detail and takes longer."""
+    """Finest resolution that is fused, pixels per radian of view; blocks of pixels of finer images are averaged first.
+    A larger one keeps more detail and takes longer."""
     field: Literal["whole", "pinhole"] = "whole"
-    """Which pixels are fused: whole takes all that the lens shows, pinhole only what an undistorted pinhole image of
-    the same size would hold."""
+    """Which pixels are fused: whole, all that the lens shows; pinhole, only what an undistorted image of the same size
+    and focal length would hold, which crops the border of a wide lens."""
     max_slope: float = 10.0
-    """Change of log distance per radian above which a pixel is left out, because the surface there is an edge or seen
-    nearly along the ray (5.7 degrees at 10). What lies between the two sides of an edge is a mixture that would
-    become a curtain. A larger one keeps more of the wall, less accurately."""
+    """Largest change of log distance per radian of view with which a pixel is fused: 10 leaves out edges, and wall seen
+    at less than 5.7 degrees to its surface. A larger one keeps more of the wall, less accurately."""
     dark: float = 0.02
-    """Brightness of the brightest channel, in [0, 1], below which a pixel's weight falls towards `unlit`, because it
-    is too dark to tell. A higher one trusts dark pixels less."""
+    """Brightness of a pixel's brightest channel, in [0, 1], below which its weight falls from 1, to unlit at black. A
+    higher one trusts dark pixels less."""
     bright: float = 0.98
-    """Brightness of the brightest channel, in [0, 1], above which a pixel's weight falls towards `unlit`, because it
-    is clipped. A higher one trusts bright pixels more."""
+    """Brightness of a pixel's brightest channel, in [0, 1], above which its weight falls from 1, to unlit at full
+    brightness, because it may be clipped. A higher one trusts bright pixels more."""
     unlit: float = 0.5
-    """Weight of a black or clipped pixel; a well-lit one has 1. A larger one trusts such pixels more; less than 0.5
-    was tried and made surfaces a little worse."""
+    """Weight, from 0 to 1, of a black or clipped pixel, a well-lit one having 1. A larger one trusts such pixels more;
+    below 0.5 surfaces came out a little worse."""
     sigma: float = 0.15
-    """Uncertainty of a pixel, as standard deviation of log distance, at which its weight has halved. A larger one
-    trusts uncertain pixels more."""
+    """Uncertainty that the model states for a pixel, as standard deviation of log distance (0.15 is 15 %), at which the
+    pixel's weight is halved. A larger one trusts uncertain pixels more; models that state none are not affected."""
 
     def __post_init__(self) -> None:
         if self.field not in ("whole", "pinhole"):

@@ -33,20 +33,20 @@ class FusionConfig:
     """Resolution and reach of the surface."""
 
     voxel: float | None = None
-    """Edge of a voxel, map units; left out, a typical observed distance over voxels_per_distance. A larger one makes
-    a coarser surface, sooner."""
+    """Edge of a voxel, the smallest cell of the volume that the surface is made in, map units; left out,
+    voxels_per_distance sets it. A larger one makes a coarser surface, sooner."""
     voxels_per_distance: float = 52.0
-    """Number of voxels in a typical observed distance, which sets their size where `voxel` does not. More make a
-    finer surface and take more time and memory."""
+    """Number of voxels in the typical distance from a submap's keyframes to their points, which sets the voxels' size
+    where voxel is left out. More make a finer surface and take more time and memory."""
     truncation: float = 6.0
-    """Distance from the surface at which signed distances are cut off, voxels. A larger one smooths more noise away,
-    and more thin folds with it."""
+    """Distance before and behind the surface, voxels, over which what the keyframes say is averaged (a TSDF's
+    truncation). A larger one smooths more noise away, and more thin folds with it."""
     min_views: int = 1
-    """Least number of keyframes that must have seen a piece of surface for it to be kept. More leave out what few
-    have seen."""
+    """Least number of keyframes that must have seen a piece of surface for it to be kept; the recipe paper keeps all.
+    More leave out what few have seen."""
     far: float = 2.0
-    """Multiple of the 90th percentile of a keyframe's inlier distances beyond which its predictions are left out. A
-    larger one reaches farther, where depth is worse."""
+    """Farthest distance from a keyframe that is fused, as a multiple of the distance within which 90 % of its inliers
+    lie. A larger one reaches farther, where depth is worse."""
 
     def voxel_for(self, submap: Submap) -> float:
         """The size of a voxel, in map units."""

@@ -18,63 +18,66 @@ class MergeConfig:
     """When two submaps are one. Lengths on the surface are shares of the reach."""
 
     by: tuple[Way, ...] = ("points", "frames", "looks")
-    """What submaps may be joined by, tried in this order: points, frames, looks and surface. "surface", the shape
-    alone, has to be asked for: chance can join what is apart."""
+    """What submaps may be joined by, tried in the order given: points (map points of both), frames (surfaces seen in
+    shared frames), looks (map points that look alike) or surface (the shape alone). surface is off unless it is named:
+    chance can join what is apart."""
     min_agreeing: int = 12
-    """Least number of correspondences that must agree on a join. More refuse more joins."""
+    """Least number of correspondences (pairs of places taken for the same) that must agree on a join by points, frames
+    or looks. More refuse more joins."""
     min_share: float = 0.2
-    """Least share of the correspondences of points and frames that must agree; 30 % wrong points in both maps leave
-    40 %. A larger one refuses more joins."""
+    """Least share, in [0, 1], of the correspondences that must agree on a join by points or frames; with 30 % wrong
+    points in both maps about 40 % do. A larger one refuses more joins."""
     min_alike_share: float = 0.1
-    """Least share of the points that look alike that must agree; most of these only look alike. A larger one refuses
-    more joins."""
+    """Least share, in [0, 1], of the pairs of points that look alike that must agree on a join by looks; most pairs
+    look alike by chance. A larger one refuses more joins."""
     tolerance: float = 0.05
-    """Distance up to which correspondences agree, as a share of that from the camera. A larger one joins less exact
-    maps, and wrong ones sooner."""
+    """Distance within which two places agree, as a share of their distance from the camera. A larger one joins less
+    exact maps, and makes wrong joins likelier."""
     trials: int = 5000
-    """Number of triples of correspondences tried. More find a join among more wrong correspondences and take
-    longer."""
+    """Number of triples of correspondences tried in search of a join, four times as many by surface. More find a join
+    among more wrong correspondences and take longer."""
     same_pixel: float = 1.0
-    """Distance up to which two observations are of one point, pixels. A larger one finds more common points, wrong
-    ones among them."""
+    """Distance, pixels, within which observations of two submaps in a shared frame count as of one point. A larger one
+    finds more common points, wrong ones among them."""
     max_turn_deg: float = 5.0
-    """Largest angle between the two poses of a shared frame, the median over them, degrees. A larger one refuses
-    fewer joins."""
+    """Largest angle, degrees, between the two poses that joined submaps give a shared frame, in the median over such
+    frames. A larger one refuses fewer joins."""
     max_shift: float = 0.1
-    """Largest distance between the two places of a shared frame, the median over them, as a share of the reach. A
-    larger one refuses fewer joins."""
+    """Largest distance between the two places that joined submaps give a shared frame, in the median over such frames,
+    as a share of the typical distance from camera to wall. A larger one refuses fewer joins."""
     max_size_ratio: float = 3.0
-    """Largest factor between the scale of a join and the ratio of the two reaches, where no frame is shared. A larger
-    one lets looks join maps that see wall at more different distances."""
+    """Largest factor between the scale of a join by looks and what the two submaps' typical distances from camera to
+    wall suggest. A larger one joins maps that see wall at more different distances, and lets more wrong scales pass."""
     size_ratios: tuple[float, ...] = (1.0, 0.7, 1.4)
-    """Ratios of the two reaches that are tried in turn by surface. More of them find submaps of more different size
-    and take longer."""
+    """Ratios of the two submaps' typical distances from camera to wall that are tried in turn by surface, 1 being
+    equally far. More of them find submaps of more different size and take longer."""
     max_pairs: int = 60
-    """Largest number of pairs of submaps that are compared by looks, and as many again by surface, the nearest in
-    time first. More find more joins and take longer."""
+    """Largest number of pairs of submaps that are compared by looks, and as many again by surface, the nearest in time
+    first. More find more joins and take longer."""
     grain: float = 0.06
-    """Spacing of the points by which shapes are compared, as a share of the reach. A larger one is coarser and
-    faster."""
+    """Spacing of the points by which shapes are compared by surface, as a share of the typical distance from camera to
+    wall. A larger one compares more coarsely and faster."""
     feature_radius: float = 0.25
-    """Radius of an FPFH feature of the shape, as a share of the reach. A larger one tells more places apart, of
-    larger surfaces only."""
+    """Radius of the wall around a point that describes its shape (FPFH) by surface, as a share of the typical distance
+    from camera to wall. A larger one tells more places apart, and needs larger surfaces."""
     max_gap: float = 0.2
-    """Largest median gap between joined surfaces along common rays, as a share of the distance; their own errors are
-    in it. A larger one refuses fewer joins."""
+    """Largest median gap between surfaces joined by points, frames or looks, along rays that meet both, as a share of
+    the distance; the surfaces' own errors are in it. A larger one refuses fewer joins."""
     max_shape_gap: float = 0.05
-    """Largest median gap after joining by shape, which leaves less, as a share of the distance. A larger one refuses
-    fewer joins."""
+    """Largest median gap between surfaces joined by surface, along rays that meet both, as a share of the distance;
+    max_gap is for the other ways. A larger one refuses fewer joins."""
     max_through: float = 0.15
-    """Largest share of the rays to one surface in whose way the other stands. A larger one refuses fewer joins."""
+    """Largest share of rays on which the other joined surface stands in front of a camera's own, by more than a quarter
+    of the distance. A larger one refuses fewer joins."""
     min_overlap: float = 0.3
-    """Least share of a camera's rays to its own surface that must meet the other one too, for that camera to judge
-    the join. A larger one judges by fewer cameras, and refuses more joins."""
+    """Least share of a camera's rays to its own surface that must meet the other one too, for that camera to judge a
+    join; judged by none, only joins by points stand. A larger one judges by fewer cameras, and refuses more joins."""
     min_shape_share: float = 0.15
-    """Least share of the features that must agree after joining by shape; by chance 5 % do at most. A larger one
-    refuses more joins."""
+    """Least share of the shape's features that must agree on a join by surface, unless min_likeness is reached; by
+    chance 5 % do at most. A larger one refuses more joins."""
     min_likeness: float = 0.1
-    """Least correlation of colour detail that is enough on its own, in [0, 1]. By chance it reaches 0.06; a pose 2
-    degrees off reaches no more. A larger one refuses more joins."""
+    """Least correlation, in [0, 1], of the fine pattern of brightness on both surfaces with which a join by surface
+    stands, unless min_shape_share is reached; chance gives 0.06. A larger one refuses more joins."""
 
     def __post_init__(self) -> None:
         unknown = set(self.by) - set(WAYS)

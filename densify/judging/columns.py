@@ -80,11 +80,20 @@ class FourWays:
 
     @classmethod
     def of(cls, view: View, method: Method) -> FourWays:
-        scale, bend = _aligned(view, method)
+        return cls.beside(*_aligned(view, method), view, method)
+
+    @classmethod
+    def beside(cls, scale: float, bend: Bend, view: View, method: Method) -> FourWays:
+        """A scale and a bend that are known already, and the constant's with the same points."""
         return cls(scale, bend, *_aligned(_constant(view), method))
 
     def errors(self, at: ObservedDistances) -> np.ndarray:
         """The share (n, 4) by which each way is off at measured distances."""
+        result: np.ndarray = np.abs(self.ratios(at) - 1)
+        return result
+
+    def ratios(self, at: ObservedDistances) -> np.ndarray:
+        """What each way says (n, 4), over the measured distances."""
         level = replace(at, predicted=np.ones(len(at)))
         guesses = [
             self.scale * at.predicted,
@@ -92,21 +101,28 @@ class FourWays:
             np.full(len(at), self.constant_scale),
             np.exp(self.constant_bend.at(level.pixels, level.predicted)),
         ]
-        result: np.ndarray = np.abs(np.stack(guesses, 1) / at.mapped[:, None] - 1)
+        result: np.ndarray = np.stack(guesses, 1) / at.mapped[:, None]
         return result
 
 
 def hidden_errors(view: View, fold: np.ndarray, method: Method) -> np.ndarray:
-    """Errors (n, 4) at every observed point of a keyframe by an alignment to the points of the other folds (n,); NaN
-    where too few are left to align to, and in folds below 0, which are never hidden."""
+    """Errors (n, 4) as `hidden_ratios` has them."""
+    result: np.ndarray = np.abs(hidden_ratios(view, fold, method) - 1)
+    return result
+
+
+def hidden_ratios(view: View, fold: np.ndarray, method: Method) -> np.ndarray:
+    """What each way says over the measured distance (n, 4), at every observed point of a keyframe, by an alignment to
+    the points of the other folds (n,); NaN where too few are left to align to, and in folds below 0, which are never
+    hidden."""
     o = view.observed
-    errors = np.full((len(o), len(WAYS)), np.nan)
+    ratios = np.full((len(o), len(WAYS)), np.nan)
     for hidden in np.unique(fold[fold >= 0]):
         rows = fold == hidden
         if (~rows).sum() >= method.alignment.min_points:
             used = replace(view, observed=o.subset(~rows))
-            errors[rows] = FourWays.of(used, method).errors(o.subset(rows))
-    return errors
+            ratios[rows] = FourWays.of(used, method).ratios(o.subset(rows))
+    return ratios
 
 
 def _aligned(view: View, method: Method) -> tuple[float, Bend]:

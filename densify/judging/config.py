@@ -13,13 +13,14 @@ class JudgeConfig:
     """How a dense map is judged where there is no truth. The surface itself uses every point."""
 
     on: bool = True
-    """Whether the result is judged, and a bend that makes it worse is undone; switched off, every bend is kept and
-    there is no verdict."""
+    """Whether the result is judged, by map points hidden from the alignment and by the images, and a bend that makes a
+    keyframe worse is undone; switched off, every bend is kept and there is no verdict."""
     folds: int = 5
-    """Number of parts that the wall is divided into, in blocks; the keyframes are aligned without each in turn. More
-    hide less at a time and take longer."""
+    """Number of parts, at least 2, that the map's points are divided into, by blocks of wall; to judge, each keyframe
+    is aligned anew with each part hidden in turn. More hide less at a time and take longer."""
     seed: int = 0
-    """Number that draws the blocks of wall. Another one hides other blocks together."""
+    """Number that draws which blocks of wall are hidden together. Another one changes the judgement slightly, and with
+    it which bends are undone."""
     parallax: ParallaxConfig = field(default_factory=ParallaxConfig)
     """how distances are measured between the images of keyframes (--judge.parallax.on false leaves them out)"""
 

@@ -6,14 +6,13 @@ image: neighbours err together.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lightdepth.frame import Frame
 from lightdepth.observations import ObservedDistances
-from lightdepth.parallax import Look, ParallaxConfig, measured, parallax_neighbours
+from lightdepth.parallax import Look, ParallaxConfig, guessed, measured, parallax_neighbours
 from lightdepth.prediction import DepthPrediction, shrunk
 from lightdepth.sparse_map import Keyframe, Submap
 
@@ -41,18 +40,18 @@ class Images:
             look = Look.of(keyframe, frame, self._config.width)
             self._seen[keyframe.name] = look, shrunk(prediction, look.keyframe.camera)
 
-    def measure(self, submap: Submap, scales: Mapping[str, float]) -> dict[str, Seen]:
-        """What the images tell of every keyframe with a scale, by name; its scale is where the search begins."""
+    def measure(self, submap: Submap) -> dict[str, Seen]:
+        """What the images tell of every keyframe that was seen, by name."""
         names = [k.name for k in submap.keyframes]
         found = {}
         neighbours = parallax_neighbours(submap, self._config) if self._seen else []
         for keyframe, beside in zip(submap.keyframes, neighbours, strict=bool(self._seen)):
-            scale = scales.get(keyframe.name, 0.0)
-            if keyframe.name not in self._seen or not scale > 0:
+            if keyframe.name not in self._seen:
                 continue
             look, prediction = self._seen[keyframe.name]
             others = [self._seen[names[j]][0] for j in beside if names[j] in self._seen]
-            found[keyframe.name] = _halves(measured(look, others, prediction, scale, self._config), keyframe)
+            told = measured(look, others, guessed(look.keyframe, submap), prediction, self._config)
+            found[keyframe.name] = _halves(told, keyframe)
         return found
 
 

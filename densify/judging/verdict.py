@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from densify.judging.columns import Columns
+from densify.judging.doubts import Doubts
 from densify.judging.withheld import Withheld
 
 Colour = Literal["green", "amber", "red"]
@@ -42,8 +43,12 @@ class Judgement:
     aligned: int = 0
     undone: int = 0
     """keyframes whose bend was undone"""
+    lessened: int = 0
+    """keyframes that keep a part of their bend"""
     bends: float = 0.0
     """median size of the bends in deviations of their prior; 1 is usual"""
+    doubts: Doubts | None = None
+    """hidden points with the uncertainty that was predicted of them; None where the model predicts none"""
 
     @property
     def number(self) -> float:
@@ -82,7 +87,9 @@ class Judgement:
             "surface": told,
             "number": self.number if np.isfinite(self.number) else None,
             "bends_undone": self.undone,
+            "bends_lessened": self.lessened,
             "bend_size": self.bends,
+            "uncertainty": None if self.doubts is None else self.doubts.calibration.record(),
         }
 
 
@@ -147,17 +154,39 @@ def _verdict(j: Judgement) -> Verdict:
             f"the map's points bend the depth against the images ({_share(j.images.bent)} off, one scale "
             f"{_share(j.images.one_scale)}): they may err together, and {j.undone} keyframes keep one scale"
         )
-    if not light.best < _NO_MERIT * light.constant:
-        remarks.append(
-            "the light adds nothing here: a constant distance does as well "
-            f"({_share(light.constant)} against {_share(light.best)})"
-        )
+    remarks += _no_merit(light)
     if red:
         return Verdict("red", "; ".join(red + amber + remarks))
     if amber:
         return Verdict("amber", "; ".join(amber + remarks))
     remarks.append(f"{j.aligned} of {j.keyframes} keyframes aligned")
     return Verdict("green", "; ".join([said, *remarks]))
+
+
+def ahead_verdict(columns: Columns, number: float, keyframes: int, aligned: int) -> Verdict:
+    """On a live surface, by points that the map measured after it; `number` is the median share by which they are off.
+
+    The map alone judges, so that nothing is green: points and surface may have drifted together.
+    """
+    if not aligned:
+        return Verdict("red", "no keyframe could be aligned")
+    few = [f"only {aligned} of {keyframes} keyframes could be aligned"] if 2 * aligned < keyframes else []
+    if columns.count < _LEAST:
+        return Verdict("amber", "; ".join([f"{columns.count} new points are too few to judge by", *few]))
+    said = (
+        f"new points of the map are {_share(number)} from the depth that was there before them, in the median "
+        f"({columns.count} points; a constant distance {_share(columns.constant)})"
+    )
+    colour: Colour = "red" if number > RED else "amber"
+    return Verdict(colour, "; ".join([said, "the map alone was asked, not the images", *few, *_no_merit(columns)]))
+
+
+def _no_merit(columns: Columns) -> list[str]:
+    """A remark where a constant distance does as well."""
+    if columns.best < _NO_MERIT * columns.constant:
+        return []
+    against = f"({_share(columns.constant)} against {_share(columns.best)})"
+    return [f"the light adds nothing here: a constant distance does as well {against}"]
 
 
 def _share(value: float) -> str:

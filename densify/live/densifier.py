@@ -18,16 +18,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from densify.aligned import align_alone, align_together
+from densify.aligned import AlignedKeyframe, align_alone, align_together
 from densify.alignment import Alignment
-from densify.config import LiveConfig, MethodConfig
-from densify.coverage import contribution, with_contributions
-from densify.dense_map import Contribution, DenseMap
+from densify.config import DensifyConfig, LiveConfig, MethodConfig
+from densify.coverage import Given, with_contributions
+from densify.dense_map import DenseMap
 from densify.fusers import view_to_fuse
 from densify.fusion.marching_cubes import unpacked
 from densify.fusion.patches import BlockSurface, Patch, joined
 from densify.fusion.rectify import SurfaceView
 from densify.fusion.volume import TsdfVolume
+from densify.live.ahead import AheadJudge
 from densify.live.packed import PackedView, Packing
 from densify.predictions import Predictor, SeenKeyframe
 from lightdepth.camera import CameraModel
@@ -38,8 +39,8 @@ from lightdepth.photometry import PhotometricCalibration
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Keyframe, Submap
 
-STEPS = ("predict", "align", "integrate", "extract")
-"""What a keyframe's time goes into, the paper's own split."""
+STEPS = ("predict", "judge", "align", "integrate", "extract")
+"""What a keyframe's time goes into: the paper's own split, and the judge."""
 
 _NEW_VOXEL = 1.25  # a map whose typical distance has changed by more, in its units, is given another voxel size
 
@@ -81,7 +82,7 @@ class _Kept:
     """its image and prediction, packed"""
     alignment: Alignment
     """how it was aligned when it was fused"""
-    given: Contribution | None = None
+    given: Given | None = None
     """what it gave to the surface; None where it was not fused"""
 
 
@@ -103,6 +104,10 @@ class Densifier:
         self.config = config
         self.id = id
         self.times: dict[str, StepTime] = {}
+        self.ahead: list[np.ndarray] = []
+        """errors of earlier depth at the new points of each keyframe, as densify.judging.ahead.Ahead takes them"""
+        judged = not isinstance(config, LiveConfig | DensifyConfig) or config.judge.on
+        self._judge = AheadJudge(config, judged)
         self._model = model
         self._light, self._mask = light or PhotometricCalibration(), mask
         self._kept: dict[str, _Kept] = {}
@@ -119,7 +124,9 @@ class Densifier:
     def kept_bytes(self) -> int:
         """Memory taken by what is kept of the keyframes."""
         parts = ((k.view.size, k.points, k.keyframe.pixels, k.keyframe.point_ids) for k in self._kept.values())
-        return sum(size + sum(array.nbytes for array in arrays) for size, *arrays in parts)
+        sigmas = (k.given.sigma for k in self._kept.values() if k.given is not None)
+        kept = sum(size + sum(array.nbytes for array in arrays) for size, *arrays in parts)
+        return kept + sum(sigma.nbytes for sigma in sigmas if sigma is not None)
 
     def warm_up(self, camera: CameraModel) -> None:
         """Does once, for a camera, what the first keyframe would otherwise wait for: tables, libraries' first calls."""
@@ -154,11 +161,15 @@ class Densifier:
             prediction = self._model(frame)
         with self._timed("integrate"):
             prediction = packing.round(prediction)
+        with self._timed("judge"):
+            last = self._kept.get(self._judge.last)
+            self.ahead.append(self._judge.asked(keyframe, points, last.keyframe if last else None))
         with self._timed("align"):
-            alignment = self._aligned(keyframe, points, SeenKeyframe(frame, prediction))
+            aligned = self._aligned(keyframe, points, SeenKeyframe(frame, prediction))
         with self._timed("integrate"):
-            self._add(_Kept(keyframe, points, packing.done(), alignment), prediction)
-        return alignment
+            self._add(_Kept(keyframe, points, packing.done(), aligned.alignment), prediction)
+        self._judge.saw(aligned)
+        return aligned.alignment
 
     def update_poses(
         self,
@@ -224,6 +235,8 @@ class Densifier:
         moved = {name: self._moved(kept, poses[name], where) for name, kept in new.items()}
         for kept in moved.values():
             self._add(kept)
+            self._judge.knows(kept.keyframe)
+        self.ahead += other.ahead
         return len(moved)
 
     def mesh(self) -> LiveMesh:
@@ -262,14 +275,14 @@ class Densifier:
         pixels = unit_range(image) if image.dtype == np.uint8 else image.astype(np.float32, copy=False)
         return Frame(keyframe.name, pixels, keyframe.camera, self._light, self._mask)
 
-    def _aligned(self, keyframe: Keyframe, points: np.ndarray, seen: SeenKeyframe) -> Alignment:
+    def _aligned(self, keyframe: Keyframe, points: np.ndarray, seen: SeenKeyframe) -> AlignedKeyframe:
         if not len(points):
-            return Alignment(keyframe.name, reason="it observed no points of the map")
+            return AlignedKeyframe(keyframe, Alignment(keyframe.name, reason="it observed no points of the map"))
         ids, first = np.unique(keyframe.point_ids, return_index=True)
         submap = Submap(self.id, (keyframe,), ids, points[first])
         alone = align_alone(keyframe, submap, seen, self.config.alignment)
         (bent,) = align_together([alone], np.zeros((1, 1), int), self.config)
-        return bent.alignment
+        return bent
 
     def _moved(self, kept: _Kept, pose: np.ndarray | None, where: _Positions) -> _Kept:
         """The keyframe at another pose and with its points where they are now; itself where nothing has changed."""
@@ -283,12 +296,9 @@ class Densifier:
             return kept
         if not known:
             return replace(kept, keyframe=keyframe, points=points)
-        return _Kept(
-            keyframe,
-            points,
-            kept.view,
-            self._aligned(keyframe, points, SeenKeyframe(prediction=kept.view.prediction())),
-        )
+        aligned = self._aligned(keyframe, points, SeenKeyframe(prediction=kept.view.prediction()))
+        self._judge.saw_again(aligned)
+        return _Kept(keyframe, points, kept.view, aligned.alignment)
 
     def _replace(self, renewed: dict[str, _Kept]) -> int:
         """Puts keyframes in the place of those of the same name; how many had to be fused anew."""
@@ -320,7 +330,7 @@ class Densifier:
             if view is None:
                 prediction = kept.view.prediction() if prediction is None else prediction
                 view = self._view(kept, prediction)
-                given = contribution(view, prediction)
+                given = Given.of(view, prediction)
             if self._volume is None:
                 self._volume = TsdfVolume(self._voxel(kept), self.config.fusion)
             self._changed.append(self._volume.integrate(view, kept.keyframe.cam_from_map))

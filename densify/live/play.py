@@ -9,13 +9,14 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from densify.config import MethodConfig
 from densify.dense_map import DenseMap
+from densify.judging.ahead import NOTHING, Ahead
 from densify.live.densifier import STEPS, Densifier, StepTime
 from densify.predictions import Predictor
 from lightdepth.datasets import FrameSequence
@@ -24,13 +25,14 @@ from lightdepth.reporting.figures import chart, chart_png
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 ALL_STEPS = ("read", *STEPS)
-_COLORS = ("#b8b8b8", "#2a6f97", "#e09f3e", "#9e2a2b", "#5a8f5a")
+_COLORS = ("#b8b8b8", "#2a6f97", "#8a6fb0", "#e09f3e", "#9e2a2b", "#5a8f5a")
 
 
 @dataclass(frozen=True, eq=False)
 class Played:
     """One keyframe. `times` by step; `arrival` and `done` in seconds since the first; `renewed` blocks were looked at
-    again, `patches` hold the surface. `reason` says why it took no part, `unread` that its image was not there."""
+    again, `patches` hold the surface. `reason` says why it took no part, `unread` that its image was not there; `ahead`
+    are errors (n, 5) of the depth before it at its new points (densify.judging.ahead)."""
 
     map: int
     keyframe: str
@@ -42,6 +44,7 @@ class Played:
     kept_bytes: int
     reason: str = ""
     unread: bool = False
+    ahead: np.ndarray = field(default_factory=lambda: NOTHING)
 
     @property
     def total(self) -> StepTime:
@@ -87,7 +90,7 @@ def _play_one(
     densifier: Densifier, submap: Submap, keyframe: Keyframe, frames: FrameSequence, arrival: float, start: float
 ) -> Played:
     wall, cpu = time.perf_counter(), time.process_time()
-    frame, reason = None, ""
+    frame, reason, asked = None, "", len(densifier.ahead)
     try:
         frame = frames.of_keyframe(keyframe)
     except InputError as error:
@@ -112,6 +115,7 @@ def _play_one(
         kept_bytes=densifier.kept_bytes,
         reason=reason,
         unread=frame is None,
+        ahead=np.concatenate([NOTHING, *densifier.ahead[asked:]]),
     )
 
 
@@ -188,18 +192,24 @@ def time_spent(played: Sequence[Played], budget: float) -> TimeSpent:
 
 
 def write_timings(played: Sequence[Played], path: Path) -> None:
-    """A table with a row for each keyframe; times in milliseconds, `cpu_…` of all threads together."""
+    """A table with a row for each keyframe; times in milliseconds, `cpu_…` of all threads together; `ahead` is the
+    median share by which the depth before it was off at its new points, `ahead_constant` that of a constant distance.
+    """
     with path.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
         table = csv.writer(file)
         steps = [f"{kind}{step}_ms" for kind in ("", "cpu_") for step in (*ALL_STEPS, "total")]
         table.writerow(
-            ["map", "keyframe", "arrival_s", "done_s", *steps, "blocks_renewed", "patches", "kept_kb", "reason"]
+            ["map", "keyframe", "arrival_s", "done_s", *steps, "blocks_renewed", "patches", "kept_kb"]
+            + ["new_points", "ahead", "ahead_constant", "reason"]
         )
         for p in played:
             times = [*(p.times.get(step, StepTime()) for step in ALL_STEPS), p.total]
             row = [f"{1000 * value:.2f}" for kind in ("wall", "cpu") for value in (getattr(t, kind) for t in times)]
             when = [f"{p.arrival:.3f}", f"{p.done:.3f}"]
-            table.writerow([p.map, p.keyframe, *when, *row, p.renewed, p.patches, p.kept_bytes // 1000, p.reason])
+            found = Ahead.of([p.ahead], 1, 1)
+            shares = [f"{v:.4f}" if len(p.ahead) else "" for v in (found.number, found.columns.constant)]
+            last = [p.renewed, p.patches, p.kept_bytes // 1000, len(p.ahead), *shares, p.reason]
+            table.writerow([p.map, p.keyframe, *when, *row, *last])
 
 
 def timings_picture(played: Sequence[Played], budget: float) -> bytes:
@@ -207,7 +217,8 @@ def timings_picture(played: Sequence[Played], budget: float) -> bytes:
     figure, axes = chart((9.0, 3.6))
     place = np.arange(len(played))
     bottom = np.zeros(len(played))
-    names = {"predict": "inference", "align": "alignment", "integrate": "integration", "extract": "marching cubes"}
+    names = {"predict": "inference", "judge": "judge", "align": "alignment", "integrate": "integration"}
+    names["extract"] = "marching cubes"
     for step, color in zip(ALL_STEPS, _COLORS, strict=True):
         height = np.array([1000 * p.times.get(step, StepTime()).wall for p in played])
         label = f"{names.get(step, 'reading')}, median {np.median(height):.1f} ms"

@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 from densify.coverage import Coverage, CoverageConfig
 from densify.coverage import coverage as coverage_of
 from densify.dense_map import DenseMap
+from densify.judging.ahead import Ahead
+from densify.judging.verdict import worst
+from densify.live.page import live_page
 from densify.live.play import Played, time_spent, timings_picture, write_timings
 from lightdepth.errors import InputError
 from lightdepth.reporting.run import Run, plain
@@ -36,12 +39,17 @@ class _MapRecord:
         seen = {} if self.coverage is None else {"coverage": self.coverage.record()}
         return {**counts, "voxel": self.voxel, **seen}
 
+    def judged(self, played: Sequence[Played]) -> Ahead:
+        """What new points of the map say of it."""
+        return Ahead.of([p.ahead for p in played if p.map == self.map], self.keyframes, self.aligned)
+
 
 class PlayedRun:
-    """The run folder of a played sequence; `mm_per_unit` where lengths are to be written in mm."""
+    """The run folder of a played sequence; `mm_per_unit` where lengths are to be written in mm, `judged` where there is
+    a verdict."""
 
-    def __init__(self, run: Run, coverage: CoverageConfig, mm_per_unit: float | None) -> None:
-        self._run, self._coverage, self._mm_per_unit = run, coverage, mm_per_unit
+    def __init__(self, run: Run, coverage: CoverageConfig, mm_per_unit: float | None, judged: bool = True) -> None:
+        self._run, self._coverage, self._mm_per_unit, self._judged = run, coverage, mm_per_unit, judged
         self._records: list[_MapRecord] = []
 
     def add(self, dense: DenseMap) -> None:
@@ -56,7 +64,7 @@ class PlayedRun:
         replace(dense, unit="mm" if scale else dense.unit).write(self._run.folder / name, ("ply",), scale)
 
     def finish(self, played: Sequence[Played], model: str, rate: float | None, budget_ms: float) -> None:
-        """Writes timings and record. Raises InputError where no keyframe of any map could be aligned."""
+        """Writes timings, page and record. Raises InputError where no keyframe of any map could be aligned."""
         run = self._run
         for p in played:
             if p.unread:
@@ -69,11 +77,22 @@ class PlayedRun:
                 f"begin with the first: {'; '.join(reasons[:3]) or 'nothing was fused'}",
             )
         write_timings(played, run.folder / "timings.csv")
-        (run.folder / "timings.png").write_bytes(timings_picture(played, budget_ms / 1000))
+        picture = timings_picture(played, budget_ms / 1000)
+        (run.folder / "timings.png").write_bytes(picture)
         spent = time_spent(played, budget_ms / 1000)
         unit = "mm" if self._mm_per_unit else "map units"
-        maps = [record.record() for record in self._records]
-        run.record.update(plain({"unit": unit, "checkpoint": model, "maps": maps, "timings": spent.record()}))
+        judged = {record.map: record.judged(played) for record in self._records if self._judged}
+        verdict = worst([found.verdict for found in judged.values()])
+        if verdict is not None:
+            run.log(f"verdict: {verdict}")
+        maps = [
+            {**record.record(), "verdict": found and plain(found.verdict), "ahead": found and found.record()}
+            for record in self._records
+            for found in [judged.get(record.map)]
+        ]
+        run.record.update(plain({"unit": unit, "checkpoint": model, "verdict": verdict, "maps": maps}))
+        run.record["timings"] = plain(spent.record())
+        live_page(verdict, judged, played, picture).write(run.folder / "report.html")
         timings = spent.timings
         assert timings is not None, "a surface has keyframes that were read"
         run.log(

@@ -28,7 +28,11 @@ def presets(verb: str) -> dict[str, Path]:
 
 def preset_help(verb: str) -> str:
     """What `--help` says of the option --preset."""
-    return f"Settings that come with lightdepth, by name: {', '.join(presets(verb))}. --config and options change them."
+    names = ", ".join(presets(verb))
+    return (
+        f"Settings that come with lightdepth, by name: {names}. Each is a file configs/{FOLDERS[verb]}/NAME.yaml, "
+        "which begins with what it is for; a --config file and single options win over it."
+    )
 
 
 def with_preset(verb: str, argv: Sequence[str], error: Callable[[str], NoReturn]) -> list[str]:

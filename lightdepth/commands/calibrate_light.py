@@ -35,15 +35,16 @@ def calibrate_light(
     Args:
         data: Folder of frames, or video, whose light is sought.
         output: File light.json to write, with a report beside it (light.html).
-        map: Sparse map of the frames: COLMAP model(s) or a multi-map tree; left out, the frames' own true depth is
-            needed.
+        map: Sparse map of the frames (poses and points of a SLAM), by which the light is fitted: COLMAP model(s) or a
+            multi-map tree; left out, the frames' own true depth is needed.
         format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
             looking if left out.
         camera: Calibration file, which wins over all others; left out, the map's own camera, else the folder's.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
             their highest values show. A larger one reads the same numbers as darker.
-        seed: Number that draws the bootstrap samples. Another one gives slightly different intervals.
+        seed: Number that draws the bootstrap samples, which tell how sure the light is. Another one gives slightly
+            different intervals.
         overwrite: Replace files that an earlier run made.
     """
     page_path = output.with_suffix(".html")

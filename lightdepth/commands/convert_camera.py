@@ -26,11 +26,13 @@ def convert_camera(
         file: Calibration of any kind that is read: camera.json, vicalib XML, OpenCV YAML, COLMAP, ocamcalib or
             intrinsics.txt.
         output: File to write the camera to, in a format that its name tells.
-        model: Lens model to have instead, fitted by least squares; left out, the file's own.
-        size: Width and height of the images, pixels; the camera is resized to them (intrinsics.txt holds none and
-            needs them). A larger one makes a camera of larger images.
-        to: Format of the output; left out, the one that its name tells.
-        mask: Image, white where tissue shows: only these pixels count in the fit.
+        model: Lens model to have instead, fitted by least squares: PINHOLE (no distortion), OPENCV, OPENCV_FISHEYE or
+            SCARAMUZZA; left out, the file's own stays.
+        size: Width and height, pixels, of the images that the camera is to be for, in the same proportion as its own
+            (intrinsics.txt holds none and needs it); left out, its own. A larger one makes a camera of larger images.
+        to: Format of the output: json, vicalib (XML), opencv (YAML), colmap, ocamcalib, or intrinsics.txt as 3 x 3 or 4
+            x 4 matrix; left out, the one that the output's name tells.
+        mask: Image, white where tissue shows: with --model, only these pixels count in the fit; left out, all do.
         overwrite: Replace a file made before.
     """
     if output.exists() and not overwrite:

@@ -43,11 +43,13 @@ def import_frames(
 
     Args:
         output: Folder to make, with the sequence and the report.
-        overlay_mask: Image, white where text is to be blacked out, besides what is found.
-        find_text: Look for burnt-in text, and black it out in the frames.
+        overlay_mask: Image of the frames' size, white where text is to be blacked out, besides what --find_text finds.
+        find_text: Look for text burnt into the frames, and black it out; switched off, only what --overlay_mask marks
+            is.
         frames: Write the frames; switched off, only the report is written, with no image of the patient, fit for
             mailing.
-        keep_names: Let run.json and the report hold the names of files.
+        keep_names: Let run.json and the report hold the names of files; switched off, they are left out, as they may
+            tell the patient.
         overwrite: Replace a folder made before.
     """
     arguments = recorded(

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
+from lightdepth.hidden_uncertainty import read_factor
 from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.progress import Progress
@@ -19,21 +23,33 @@ def predict(
     output: Path,
     checkpoint: str = DEFAULT_CHECKPOINT,
     refine: int = 0,
+    uncertainty: Path | None = None,
     previews: bool = True,
     overwrite: bool = False,
 ) -> None:
     """Distance, albedo and normals of every frame of a sequence, as one .npz a frame.
 
     Args:
-        output: Folder to make, with one .npz for each frame.
-        checkpoint: Depth model: a path, the name of a bundled one, decline (the closed form) or constant.
-        refine: Number of steps in which each image's distance is improved by its own light; 0 for none. More follow
-            the light further and take longer.
-        previews: Also write a PNG with image and distance for every frame.
-        overwrite: Replace a folder made before.
+        output: Folder to make, with one .npz for each frame: distance (up to scale), albedo and normals.
+        checkpoint: Depth model: a path (.safetensors or .ckpt) or a bundled name (lightdepth-synthetic or
+            lightdepth-self); decline, distance by formula from brightness alone; constant, the same distance
+            everywhere, to compare with.
+        refine: Number of steps in which the distance of each image is changed so that the light which it would give
+            comes closer to that which is seen; 0 for none. More follow the light further and take longer.
+        uncertainty: Run folder of `densify` on the same endoscope with the same checkpoint, or its uncertainty.json;
+            the predicted uncertainty is multiplied by the factor that hidden blocks of that map say. A larger factor
+            makes wider intervals. Left out, uncertainty is written as predicted.
+        previews: true: a PNG with the image and its distance is written for every frame as well, into previews/. false:
+            none is.
+        overwrite: Replace a folder made before. Without it, a folder that is already there is refused.
     """
-    arguments = recorded(source, output=output, checkpoint=checkpoint, refine=refine, previews=previews)
+    arguments = recorded(
+        source, output=output, checkpoint=checkpoint, refine=refine, uncertainty=uncertainty, previews=previews
+    )
+    if refine and uncertainty is not None:
+        raise InputError("--uncertainty", "refined distance has no uncertainty", "leave out one of it and --refine")
     model = load_model(checkpoint)
+    factor = None if uncertainty is None else read_factor(uncertainty, model.name)
     if refine:
         model = RefinedModel(model, RefineConfig(steps=refine))
     frames = source.open()
@@ -50,6 +66,8 @@ def predict(
                 continue
             prediction = model(frame)
             nothing += not prediction.valid.any()
+            if factor is not None and prediction.uncertainty is not None:
+                prediction = replace(prediction, uncertainty=prediction.uncertainty * np.float32(factor))
             prediction.save(run.folder / f"{frame.name}.npz")
             if previews:
                 colors = colored_distance(prediction.distance, prediction.valid)
@@ -61,3 +79,4 @@ def predict(
         if nothing:
             run.warn(f"{nothing} of {len(frames)} frames have no valid pixel: they are black, or masked")
         run.record["checkpoint"] = model.name
+        run.record["uncertainty_factor"] = factor

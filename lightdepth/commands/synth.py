@@ -27,23 +27,27 @@ class ColonConfig:
     """A synthetic colon, the endoscope in it, and the way that it takes."""
 
     lens: Lens = "c3vd"
-    """Lens of the endoscope: pinhole, telescope, fisheye or c3vd."""
+    """Lens of the endoscope: pinhole (90 degrees across), telescope (70), fisheye (136) or c3vd (that of the data set
+    C3VD)."""
     frames: int = 120
     """Number of frames to render, spread evenly over --travel_mm. More lie closer together on the same path, and take
     longer."""
     size: tuple[int, int] = (320, 256)
     """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
     seed: int = 0
-    """Number that draws the colon, its light and the path. Another one draws another colon."""
+    """Number that draws the colon, its light, the path and the SLAM's errors. Another one draws others."""
     travel_mm: float = 36.0
-    """Length of the path along the colon, mm. A longer one makes neighbouring frames less alike."""
+    """Length of the path along the colon, mm. A longer one, with as many frames, makes neighbouring frames less
+    alike."""
     light: str | None = None
-    """Light to have instead of a drawn one: light.json, or gamma=2.2,mu=0."""
+    """Light to have instead of a drawn one: a light.json, or its terms, as in gamma=2.2,mu=0 (gamma: the camera's
+    response; mu: how narrow the beam is, 0 shining alike to all sides)."""
     family: Literal["plain", "realistic"] = "plain"
-    """Kind of colon: plain (the tube, its folds and its light) or realistic (with all that real images have)."""
+    """Kind of colon: plain (tube, folds, vessels; its ranges are under --scene) or realistic (also polyps, mucus,
+    bubbles, blur and what else real images have; it takes no --scene)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where the frames are rendered: cpu, cuda, or auto, the GPU where there is one and the extra gpu is
-    installed."""
+    """Where frames are rendered: cpu, cuda (a GPU; needs the extra gpu), or auto, the GPU where there is one and that
+    extra is installed."""
 
     def __post_init__(self) -> None:
         if self.frames < 1:
@@ -89,10 +93,10 @@ def synth(
 
     Args:
         output: Folder to make, with the frames, their truth and the SLAM export.
-        layout: How files are laid out: frames (our own folder), c3vd, or endomapper (out1.png, ... and XML; its truth
-            is in truth/sequence).
-        spurious: Share of the map points that are wrong; left out, slam.spurious. A larger one makes the map harder
-            to densify.
+        layout: How the files of the sequence are laid out: frames (our own folder), c3vd (as C3VD), or endomapper
+            (out1.png, ... and XML, its truth in truth/sequence; not with --lens c3vd).
+        spurious: Share of the map points, in [0, 1), that are wrong; it wins over --slam.spurious, which holds where
+            this is left out. A larger one makes the map harder to densify.
         scene: ranges of shape, texture and sensor of plain colons
         slam: quality of the simulated SLAM
         errors: errors that neighbouring points or stretches of the path share, on top of those of the SLAM

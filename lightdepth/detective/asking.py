@@ -19,7 +19,8 @@ class PairingConfig:
     """What is asked of frames and a map that are brought together."""
 
     trust_map: bool = False
-    """Go on with a map whose frames, by their images, are others than those that it was made of, and only warn."""
+    """true: where the images say that the map was made of other frames than these, a warning is given and the run goes
+    on. false: the run stops with an error."""
 
 
 def check_pairing(

@@ -34,11 +34,14 @@ class PictureConfig:
     """How pictures are cut, resized and freed of interlacing."""
 
     size: tuple[int, int] | None = None
-    """Width and height to resize the frames to, pixels; the camera is rescaled. A larger one keeps finer detail."""
+    """Width and height to resize the frames to, pixels, the camera with them; left out, they keep theirs. A larger one
+    keeps finer detail."""
     crop: Literal["none", "auto"] = "none"
-    """Whether the black border is cut off: none, or auto, which crops the camera as well."""
+    """Whether the black border around the tissue is cut off: none keeps it; auto cuts it off and shifts the camera's
+    centre to match."""
     deinterlace: bool = False
-    """Keep one field of each frame and interpolate the rows between."""
+    """Keep the even rows of each frame and interpolate the odd ones, for interlaced video, where moving edges look like
+    combs; switched off, frames stay as they are."""
 
     def __post_init__(self) -> None:
         if self.size is not None and min(self.size) < 1:

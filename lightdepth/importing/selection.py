@@ -20,21 +20,23 @@ class Choice:
     """Which frames to keep."""
 
     rate: float | None = None
-    """Number of frames per second to keep, the sharpest of each interval; left out, 5 for a video, all of a folder.
-    More keep more frames."""
+    """Number of frames to keep per second, the sharpest of each interval; left out, 5 for a video, and all of a folder.
+    More keep more frames; not with --every."""
     every: int | None = None
-    """Number of frames from one that is kept to the next, instead of a rate. More keep fewer frames."""
+    """Number N of which every N-th of the sharp frames is kept, instead of a rate per second. More keep fewer
+    frames."""
     start: float = 0.0
-    """Time of the first frame to keep, seconds from the first frame. A larger one leaves out more at the
+    """Time before which frames are left out, seconds from the first frame. A larger one leaves out more at the
     beginning."""
     end: float | None = None
-    """Time of the last frame to keep, seconds from the first frame; left out, all are kept. A larger one leaves out
-    less at the end."""
+    """Time after which frames are left out, seconds from the first frame; left out itself, all are kept to the last. A
+    larger one keeps more."""
     blur: float = 0.6
-    """A frame is left out as blurred when its sharpness is below this share of that of the sharper frames within
-    about a second before and after; 0 keeps all. A larger one leaves out more."""
+    """Share, in [0, 1), of the sharpness of the sharper frames within about a second before and after, below which a
+    frame is left out as blurred; 0 keeps all. A larger one leaves out more."""
     max_frames: int | None = None
-    """Largest number of frames to keep, spread evenly over the rest. More keep more frames."""
+    """Largest number of frames to keep; where the other options leave more, so many of them are taken evenly. More keep
+    more frames; left out, there is no limit."""
 
     def __post_init__(self) -> None:
         if self.end is not None and self.end <= self.start:

@@ -37,25 +37,33 @@ class NetworkConfig:
     """Which network. Plain values, so that it travels as JSON inside a checkpoint."""
 
     kind: Literal["tiny", "unet", "dpt"] = "tiny"
-    """Which network: "tiny" (0.5 M parameters), "unet" (ResNet encoder) or "dpt" (vision transformer, extra
-    `dpt`)."""
+    """Which network is trained: "tiny" is small and fast (0.5 million weights); "unet" has a ResNet as its encoder (14
+    million and more); "dpt" is a vision transformer (6 million and more, needs the extra `dpt`)."""
     inputs: tuple[Input, ...] = ("rgb", "closed_form", "ray_z")
-    """Channels that go into the network: some of rgb, closed_form, ray_z, mask and reflectance."""
+    """What the network sees at each pixel, a list: rgb (the image), closed_form (log distance, computed from brightness
+    alone), ray_z (cosine of the angle from the optical axis), mask (whether tissue shows), reflectance (the share of
+    light that the wall throws back, as the calibration has it). What is left out, it has to do without."""
     output: Literal["residual", "absolute", "free"] = "residual"
-    """What the network says: "residual" (a correction of the closed form) or "absolute" (log distance itself), both
-    with its scale; or "free" (log distance with a scale of its own, for losses with a fixed gain)."""
+    """What the network answers at each pixel: "residual", what is to be added to the log distance of the closed form
+    (which brightness alone gives); "absolute", the log distance itself, but with the closed form's mean in each image;
+    "free", log distance with a scale of its own, as --model.loss.gain one needs it."""
     encoder: Encoder | None = None
-    """Encoder of the network: for unet resnet18 (14 M), resnet34 or resnet50; for dpt vits14 (25 M), vitb14, vitl14
-    or vitt14. null takes resnet18 and vits14."""
+    """Encoder, the part of the network that reads the image: for unet resnet18 (14 million weights), resnet34 or
+    resnet50; for dpt vitt14 (6 million), vits14 (25), vitb14 (97) or vitl14 (335). Those with more weights are stronger
+    and slower. null takes resnet18 or vits14; tiny has no choice."""
     uncertainty: bool = False
-    """Whether the network has a head of its own for the standard deviation of log distance."""
+    """true: the network also says how uncertain it is at each pixel, the standard deviation of log distance; it learns
+    that where --model.loss.uncertainty is above 0. false: it gives distance and albedo (the wall's colour) only."""
     width: int = 16
-    """Number of channels of the tiny network's first level. More make a stronger and slower network."""
+    """Number of channels of the first level of the tiny network; deeper levels have 2 to 6 times as many, and other
+    kinds do not use it. More make a stronger and slower network."""
     norm: Literal["batch", "group"] = "group"
-    """Normalisation of the tiny network: over the "batch", or over a "group" of channels."""
+    """How the tiny network normalises its channels: "batch", by mean and deviation over all images of a batch; "group",
+    over groups of channels of each image by itself, whatever the size of the batch. Other kinds do not use it."""
     blur: float = 0.018
-    """Width of the blur of the closed form that goes in, as a share of the image height. A larger one hides more of
-    its texture from the network."""
+    """Deviation (sigma) of the Gaussian blur of the closed form (distance from brightness alone), as network input and
+    under the output "residual", as a share of the image height; 0 for none. A larger one leaves less of the image's
+    texture in it."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inputs", tuple(self.inputs))  # JSON has lists

@@ -22,44 +22,48 @@ class SfmConfig:
     """How frames are mapped."""
 
     max_features: int = 4096
-    """Largest number of SIFT features in a frame; the strongest ones are taken. More find more points and take
-    longer."""
+    """Largest number of features (distinct places, by SIFT) taken of a frame, the strongest ones. More find more points
+    and take longer."""
     peak_threshold: float = 0.003
-    """Least contrast of a feature, in [0, 1]; COLMAP's 0.0067 misses smooth tissue. A higher one finds fewer
-    features."""
+    """Least contrast of a feature, with brightness in [0, 1]; COLMAP's own 0.0067 finds too few on smooth tissue. A
+    higher one finds fewer features."""
     mask_erosion_px: int = 4
     """Distance that features keep from the border of the mask, pixels. A larger one leaves out more of the image."""
     highlight: float = 0.98
-    """Brightness, in [0, 1], which all three channels of a pixel reach in a highlight. A higher one takes fewer
-    pixels for highlights."""
+    """Brightness, in [0, 1], which red, green and blue must all reach for a pixel to be a highlight, where no feature
+    is taken. A higher one takes fewer pixels for highlights."""
     highlight_margin_px: int = 3
     """Distance that features keep from a highlight, pixels. A larger one leaves out more of the image."""
     contrast: float = 2.0
-    """Clip limit of CLAHE, a factor, which evens the contrast of dark and bright tissue; 0 leaves it as it is. A
-    larger one brings out more, noise included."""
+    """Strength of evening out the contrast of dark and bright tissue before features are looked for, a factor (CLAHE's
+    clip limit); 0 leaves images as they are. A larger one brings out more, noise included."""
     matching: Literal["auto", "sequential", "exhaustive"] = "auto"
-    """Which frames are matched: sequential, those that follow each other or look alike; exhaustive, all with all;
-    auto, exhaustive for few frames."""
+    """Which frames are matched with each other: sequential, those that follow each other or look alike; exhaustive, all
+    with all, which takes longer; auto, exhaustive for up to `exhaustive_up_to` frames, else sequential."""
     exhaustive_up_to: int = 40
-    """Number of frames up to which `auto` matches all with all; longer sequences are matched sequentially. More find
-    more connections, in time that grows with their square."""
+    """Number of frames up to which --sfm.matching auto matches all with all; longer sequences are matched sequentially.
+    More find more connections, in time that grows with their square."""
     overlap: int = 10
-    """Number of frames matched ahead of each, when sequential. More bridge longer gaps and take longer."""
+    """Number of frames after each that it is matched with, in sequential matching. More bridge longer gaps and take
+    longer."""
     alike: int = 5
-    """Number of frames matched with each besides, when sequential: those farther off that look most alike. More close
-    more loops and take longer."""
+    """Number of frames farther off that each is also matched with, in sequential matching, those that look most like
+    it; 0 for none. More find more places that are seen again, and take longer."""
     min_model_size: int = 3
-    """Least number of frames in a submap. More leave out small submaps."""
+    """Least number of frames of a submap (a part of the map that hangs together, with a scale of its own); smaller ones
+    are left out. More leave out more."""
     min_points: int = 8
-    """Least number of points in a submap. More leave out poor submaps."""
+    """Least number of points of a submap (a part of the map that hangs together, with a scale of its own); poorer ones
+    are left out. More leave out more."""
     init_min_tri_angle: float = 4.0
-    """Least angle between the rays of the first pair of frames, degrees. A larger one starts from a safer pair, where
-    there is one."""
+    """Least angle, degrees, between the lines of sight of the two frames that a map begins with; COLMAP asks for less
+    where no pair has it. A larger one begins with a safer pair, where there is one."""
     init_min_num_inliers: int = 50
-    """Least number of matches that the first pair of frames needs. More start from a safer pair, where there is
-    one."""
+    """Least number of matches between the two frames that a map begins with; COLMAP asks for fewer where no pair has so
+    many. More begin with a safer pair, where there is one."""
     num_threads: int = 1
-    """Number of threads for features, matches and mapping. More change the last bits from run to run, and were not
-    faster on two cores."""
+    """Number of threads for features, matches and mapping. More make the map differ in the last digits from run to run,
+    and were not faster on two cores."""
     seed: int = 0
-    """Number that draws the samples of every RANSAC in it. Another one makes a slightly different map."""
+    """Number that the random samples of robust fits (RANSAC) follow from. Another one makes a slightly different
+    map."""

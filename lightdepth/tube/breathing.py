@@ -21,12 +21,14 @@ class BreathingConfig:
     """How the wall of a colon moves."""
 
     amplitude: float = 0.0
-    """Largest change of the colon's radius, as a share of it; 0 keeps the wall still. A larger one moves it more."""
+    """Largest change of the colon's radius, as a share of it, up to 0.3; 0 keeps the wall still, and more needs
+    --slam.kind tracked. A larger one moves the wall more."""
     period: float = 4.0
-    """Time from one breath or wave to the next, seconds. A longer one moves the wall more slowly."""
+    """Time from one breath (or wave) to the next, seconds; without an amplitude it does nothing. A longer one moves the
+    wall more slowly."""
     wavelength_mm: float = 0.0
-    """Distance from one wave to the next along the colon (peristalsis), mm; 0 lets the whole colon breathe at once. A
-    larger one makes longer waves."""
+    """Distance from one wave to the next along the colon (peristalsis), mm; 0 lets the whole colon widen and narrow at
+    once. A larger one makes longer waves; without an amplitude there are none."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.amplitude <= 0.3:

@@ -23,11 +23,13 @@ class FilmConfig:
     """Ends of the range of the share of the wall under a film of mucus. A larger one covers more of it; (0, 0) makes
     none."""
     mucus_tint: tuple[float, float] = (0.0, 0.4)
-    """Ends of the range of the share of the wall's colour that mucus hides. A larger one makes thicker mucus."""
+    """Ends of the range of the share of the wall's colour that mucus hides where it lies (see mucus). A larger one
+    makes mucus more opaque."""
     bubbles: tuple[int, int] = (0, 0)
-    """Least and largest number of clusters of bubbles in a colon. More hide more of the wall."""
+    """Least and largest number of clusters of 3 to 29 bubbles each in a colon. More hide more of the wall."""
     bubble_radius: tuple[float, float] = (0.5, 1.8)
-    """Ends of the range of the radius of a bubble, mm. A larger one makes larger bubbles."""
+    """Ends of the range of the radius of the largest bubbles of a cluster, mm; the others go down to 0.4 of it. A
+    larger one makes larger bubbles."""
     stool: tuple[int, int] = (0, 0)
     """Least and largest number of specks of stool in a colon. More hide more of the wall."""
     stool_radius: tuple[float, float] = (0.4, 2.5)

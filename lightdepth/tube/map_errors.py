@@ -32,28 +32,29 @@ class MapErrors:
     """Errors of a map that neighbouring points share, each with its size; left as they are, there are none."""
 
     drift: float = 1.0
-    """Scale of each submap where its path begins, against 1 where it ends, as a factor; keyframes and points follow
-    it. A larger one makes the beginning larger, one below 1 smaller than the end."""
+    """Scale of each submap at the beginning of its path, as a factor of that at the end, from 0.1 to 10, changing
+    steadily between; 1 is no drift. A larger one makes the beginning larger; below 1 it is smaller than the end."""
     side_share: float = 0.0
-    """Share of a submap's points, one side of the wall, that are moved away from the keyframes that saw them. A larger
-    one moves a wider side."""
+    """Share, in [0, 1], of a submap's points, all on one side of the wall, whose distance from the keyframes that saw
+    them is multiplied by side_factor. A larger one makes that side wider."""
     side_factor: float = 1.3
-    """Factor by which the moved side is further away. A larger one moves it further, one below 1 nearer."""
+    """Factor, from 0.1 to 10, on the distance of the points that side_share names. A larger one puts them farther away;
+    below 1 they come nearer."""
     fold_share: float = 0.0
-    """Share of a submap's points, one patch of wall, that are taken for the same places on the next fold. A larger one
-    makes a larger patch."""
+    """Share, in [0, 1], of a submap's points, one patch of wall, that are put on the next fold, as if mistaken for it
+    (see fold_shift). A larger one makes a larger patch."""
     fold_shift: float = 0.6
-    """Distance from one fold to the next, as a share of the submap's typical distance. A larger one shifts the patch
-    further ahead, one below 0 back."""
+    """How far the patch of fold_share is moved ahead, as a share of the typical distance from a submap's keyframes to
+    its points. A larger one moves it farther; below 0 it moves back."""
     pose_drift: float = 0.0
-    """How far the last keyframe is from its place, as a share of the path's length; it grows from 0 at the first. A
-    larger one bends the path more."""
+    """How far the last keyframe is from its true place, as a share of the path's length; the error grows along the
+    path, from 0 at the first. A larger one bends the path more."""
     pose_drift_deg: float = 0.0
-    """How far the last keyframe is turned, degrees; it grows from 0 at the first. A larger one turns the keyframes
-    more."""
+    """How far the last keyframe is turned from its true direction, degrees; the error grows along the path, from 0 at
+    the first. A larger one turns the keyframes more."""
     points_follow: bool = False
-    """Whether points move with the drifting keyframes that saw them, as a SLAM's own do; else they stay where they
-    are, and the poses contradict them."""
+    """Whether points move along with the keyframes that saw them when these drift (pose_drift, pose_drift_deg), as in a
+    real SLAM; switched off, they stay where they are, and the poses contradict them."""
 
     def __post_init__(self) -> None:
         for name in ("drift", "side_factor"):

@@ -25,12 +25,12 @@ class PathConfig:
     """How the endoscope moves; pairs are the ends of a uniform range."""
 
     sway: float = 0.13
-    """Deviation from the centreline, as a share of the radius; the path leaves the centreline by 0.3 / 0.13 times as
-    much at most. A larger one looks at the wall from nearer."""
+    """Standard deviation of how far the path strays from the colon's centreline, in each of two directions, as a share
+    of the radius; it is cut off at 2.3 times that. A larger one brings the camera nearer to the wall."""
     turned: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the angle by which each view is turned away from the way ahead, in any direction, radians.
-    A larger one looks at walls more from the front, and neighbouring frames then have little to do with each
-    other."""
+    """Ends of the range of the angle, radians, by which each view is turned from the way ahead, in a direction of its
+    own; (0, 0) looks ahead. A larger one looks at walls more from the front, and makes neighbouring frames less
+    alike."""
 
 
 def lens(kind: str, width: int, height: int) -> CameraModel:

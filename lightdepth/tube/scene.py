@@ -39,21 +39,23 @@ from lightdepth.tube.wall import WallMap, place_of
 @dataclass(frozen=True)
 class TubeConfig:
     shape: ShapeConfig = field(default_factory=ShapeConfig)
-    """Ranges of the shape of a colon."""
+    """Ranges of the shape of a colon (of two ends, a value between is drawn for each)."""
     texture: TextureConfig = field(default_factory=TextureConfig)
-    """Ranges of what is painted on the wall of a colon."""
+    """Ranges of what is painted on the wall of a colon (of two ends, a value between is drawn for each)."""
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    """Ranges of the light and the camera of an endoscope."""
+    """Ranges of the light and the camera of an endoscope (of two ends, a value between is drawn for each)."""
     film: FilmConfig = field(default_factory=FilmConfig)
-    """Ranges of what lies on the wall of a colon: mucus, bubbles, stool."""
+    """Ranges of what lies on the wall of a colon: mucus, bubbles, stool (of two ends, a value between is drawn for
+    each)."""
     path: PathConfig = field(default_factory=PathConfig)
     """How the endoscope moves through the colon."""
     patch: float = 3.5
-    """Length along the tube of the patches of wall that light each other, mm. A larger one makes coarser indirect
-    light, sooner."""
+    """Length along the tube, mm, of the patches of wall between which light is thrown to and fro. A larger one makes
+    coarser indirect light, sooner."""
     least_cosine: float = 0.0
-    """Least cosine to the viewer of a normal interpolated across a fold's edge; 0 leaves normals as they are. A
-    larger one turns such normals more towards the camera."""
+    """Least cosine between the wall's normal, interpolated over its mesh, and the direction to the camera; normals
+    turned farther away, at the edges of folds, are turned back to it. A larger one turns more of them; 0 leaves all as
+    they are."""
 
 
 def realistic() -> TubeConfig:

@@ -26,68 +26,74 @@ class SensorConfig:
     nothing else is said; everything from cosine_exponent on is off."""
 
     gamma: tuple[float, float] = (2.0, 2.6)
-    """Ends of the range of the exponent gamma of the camera's response v^(1/gamma). A larger one brightens dark parts
-    more."""
+    """Ends of the range of the exponent gamma of the camera's response: light v, in [0, 1], becomes the code
+    v^(1/gamma). A larger one brightens dark parts more."""
     mu: tuple[float, float] = (2.2, 3.4)
     """Ends of the range of the exponent mu of the light's spread exp(-mu (1 - cos psi)), psi the angle from its axis.
     A larger one makes a narrower light."""
     light_offset: float = 2.0
-    """Deviation of the light's position sideways, mm. A larger one puts lamps farther from the camera."""
+    """Root mean square of the distance by which the light sits beside the camera, mm, drawn for each endoscope. A
+    larger one puts lamps farther from the camera."""
     reflectance: tuple[float, float] = (0.0, 0.7)
-    """Ends of the range of the share of light that the wall throws back on other wall. A larger one makes more
-    indirect light."""
+    """Ends of the range of the share of the light falling on it that the wall throws back on other wall. A larger one
+    makes more indirect light."""
     specular: tuple[float, float] = (0.0, 0.5)
-    """Ends of the range of a factor on the strength of highlights. A larger one makes brighter highlights; (0, 0)
-    makes none."""
+    """Ends of the range of a factor on the strength of highlights (mirrored light of the lamp). A larger one makes
+    brighter highlights; (0, 0) makes none."""
     bright_share: tuple[float, float] = (0.03, 0.2)
-    """Ends of the range of the share of pixels that auto exposure lets saturate. A larger one makes brighter
-    images."""
+    """Ends of the range of the share of an image's pixels that auto exposure lets reach full brightness. A larger one
+    makes brighter images."""
     shoulder: tuple[float, float] = (0.75, 1.0)
-    """Ends of the range of the code value, in [0, 1], from which the tone curve bends. A higher one bends less; 1 is
-    none."""
+    """Ends of the range of the code value (brightness as stored), in [0, 1], from which the tone curve flattens towards
+    white. A higher one flattens less of it; 1 none."""
     noise: tuple[float, float] = (0.003, 0.012)
-    """Ends of the range of the deviation of the noise, code values in [0, 1]. A larger one makes noisier images."""
+    """Ends of the range of the standard deviation of the noise that does not depend on the light, in code values
+    (brightness as stored, in [0, 1]). A larger one makes noisier images."""
     exposure: tuple[float, float] = (0.1, 0.1)
-    """Ends of the range of the deviation of the log of the gain from frame to frame. A larger one makes brightness
-    jump more."""
+    """Ends of the range of the standard deviation of the log of the exposure from frame to frame (0.1 is about 10 %). A
+    larger one makes brightness jump more."""
     cosine_exponent: tuple[float, float] = (1.0, 1.0)
-    """Ends of the range of the exponent of the cosine of reflection: 1 is Lambert; rough walls have less, satin ones
-    more (Minnaert: 2k - 1). A larger one makes slanted wall darker."""
+    """Ends of the range of the exponent on the cosine between the wall's normal and the direction to the lamp: 1 is
+    matt (Lambert), rough walls have less, satin ones more. A larger one makes slanted wall darker."""
     gloss: tuple[float, float] = (60.0, 60.0)
-    """Ends of the range of the exponent of the highlights' lobe. A larger one makes smaller, sharper highlights."""
+    """Ends of the range of the exponent of the lobe of highlights (as in Phong's model). A larger one makes smaller,
+    sharper highlights."""
     roughness: tuple[float, float] = (0.1, 0.1)
-    """Ends of the range of the slope, a ratio, of the bumps that break up highlights. A larger one scatters them
-    more."""
+    """Ends of the range of the slope, a ratio of height to length, of bumps about a millimetre wide that break up
+    highlights. A larger one scatters highlights more."""
     sparkle: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the slope, a ratio, of the finest relief, tenths of a millimetre wide. A larger one breaks
-    highlights into more sparks."""
+    """Ends of the range of the slope, a ratio of height to length, of relief tenths of a millimetre wide. A larger one
+    breaks highlights into more sparks; (0, 0) has no such relief."""
     vignetting: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the exponent k of the lens's vignetting cos^k psi. A larger one makes darker corners."""
+    """Ends of the range of the exponent k of the lens's darkening to the side, cos^k of the angle from its axis; (0, 0)
+    is none. A larger one makes darker corners."""
     glare: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the share of light that the lens spreads over the whole image. A larger one veils dark
-    parts more."""
+    """Ends of the range of the share of the light that the lens spreads over the rest of the image. A larger one veils
+    dark parts more; (0, 0) makes none."""
     bloom: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the share of what is above white that spills over to its surroundings. A larger one makes
-    wider halos."""
+    """Ends of the range of the share of the light above white that spills over to the pixels around. A larger one makes
+    brighter halos around saturated spots; (0, 0) makes none."""
     motion: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the median length of motion blur, as a share of the image height. A larger one blurs
-    more."""
+    """Ends of the range of the length of motion blur (median over an image's pixels, on average over images), as a
+    share of the image height. A larger one blurs more; (0, 0) makes none."""
     defocus: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the sigma of the focus blur, as a share of the image height. A larger one blurs more."""
+    """Ends of the range of the sigma (radius) of the blur out of focus, as a share of the image height. A larger one
+    blurs more; (0, 0) makes none."""
     cast: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the deviation of the log of the white balance. A larger one makes stronger colour
-    casts."""
+    """Ends of the range of the standard deviation of the log of each colour channel's gain (0.06 is about 6 %). A
+    larger one makes stronger colour casts; (0, 0) makes none."""
     contrast: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the strength of the tone curve's S, a factor from -1 to 1. A larger one makes more
-    contrast."""
+    """Ends of the range of a factor, from -1 to 1, on an S-shaped bend of the tone curve; 0 leaves it, below 0 flattens
+    it. A larger one makes more contrast."""
     shot_noise: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the deviation of the noise at linear white, a share of it, which falls with the root of
-    the light. A larger one makes noisier images."""
+    """Ends of the range of the standard deviation, at white, of the noise that grows with the root of the light, as a
+    share of white. A larger one makes noisier images; (0, 0) makes none."""
     sharpen: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the weight of the processor's unsharp masking. A larger one makes harder edges."""
+    """Ends of the range of the weight with which the processor adds fine detail back (unsharp masking); (0, 0) is none.
+    A larger one makes harder edges."""
     jpeg: tuple[int, int] = (100, 100)
-    """Ends of the range of the JPEG quality, a number up to 100, with halved chroma; 100 is no compression. A higher
-    one leaves fewer artefacts."""
+    """Ends of the range of the JPEG quality, a number from 0 to 100, with colour at half resolution; at 100 images are
+    not compressed. A higher one leaves fewer artefacts."""
 
 
 @dataclass(frozen=True)

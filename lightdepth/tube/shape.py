@@ -23,35 +23,40 @@ class ShapeConfig:
     radius: tuple[float, float] = (15.0, 25.0)
     """Ends of the range of the mean radius, mm. A larger one makes a wider colon."""
     bend: tuple[float, float] = (0.0, 0.9)
-    """Ends of the range of how far the direction swings along the tube, radians. A larger one makes a more winding
-    colon."""
+    """Ends of the range of how far the tube's direction may turn to either side along its length, radians. A larger one
+    makes a more winding colon."""
     fold_spacing: tuple[float, float] = (11.0, 24.0)
-    """Ends of the range of the distance from one fold to the next, mm. A larger one makes fewer folds."""
+    """Ends of the range of the distance from one fold to the next, mm, drawn from fold to fold. A larger one makes
+    fewer folds."""
     fold_depth: tuple[float, float] = (0.12, 0.38)
-    """Ends of the range of how far folds reach into the lumen, as a share of the radius. A larger one hides more wall
-    behind them."""
+    """Ends of the range of how far a fold reaches into the lumen, as a share of the radius; each fold draws its own. A
+    larger one hides more wall behind folds."""
     fold_width: tuple[float, float] = (1.6, 3.2)
-    """Ends of the range of a fold's half width along the tube, mm. A larger one makes blunter folds."""
+    """Ends of the range of a fold's half width along the tube, mm; each fold draws its own. A larger one makes blunter
+    folds."""
     bump: tuple[float, float] = (0.01, 0.05)
-    """Ends of the range of the wall's undulation between the folds, as a share of the radius. A larger one makes a
-    less even wall."""
+    """Ends of the range of the deviation of the wall from a smooth tube between the folds, as a share of the radius. A
+    larger one makes a less even wall."""
     step: float = 0.8
-    """Distance between the grid's points on the wall, mm. A larger one makes a coarser wall, sooner."""
+    """Distance between neighbouring points of the mesh that the wall is made of, mm. A larger one makes a coarser wall,
+    sooner."""
     crescent: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range, in [0, 1], of the share by which the three parts of a fold differ; at 1 some are missing. A
-    larger one makes less regular folds."""
+    """Ends of the range of how unlike the three parts of a fold are, a share in [0, 1]: at 0 alike, at 1 each is
+    anything from missing to a third deeper. A larger one makes less regular folds."""
     waviness: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of how far a fold's course deviates from a plane, mm. A larger one makes wavier folds."""
+    """Ends of the range of how far a fold's line around the tube strays from a plane, mm. A larger one makes wavier
+    folds."""
     taeniae: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of how far three bands pull the wall inwards, as a share of the radius. A larger one makes a
-    more triangular lumen."""
+    """Ends of the range of how far three bands along the tube (taeniae) pull the wall inwards, as a share of the
+    radius. A larger one makes a more triangular lumen."""
     polyps: tuple[int, int] = (0, 0)
-    """Least and largest number of polyps in a colon. More make images without one rarer."""
+    """Least and largest number of polyps in a colon, between which it is drawn. More polyps leave fewer images without
+    one."""
     polyp_radius: tuple[float, float] = (1.5, 5.0)
-    """Ends of the range of the radius of a polyp's head, mm. A larger one makes larger polyps, as far as the
-    endoscope can pass."""
+    """Ends of the range of the radius of a polyp's head, mm. A larger one makes larger polyps, but never so large that
+    the endoscope cannot pass."""
     stalked: float = 0.35
-    """Share of polyps that stand on a stalk. A larger one makes fewer flat ones."""
+    """Share of polyps, in [0, 1], that stand on a stalk; the others are flat domes. A larger one makes more stalks."""
 
 
 @dataclass(frozen=True)

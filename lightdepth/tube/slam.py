@@ -32,41 +32,43 @@ class SlamConfig:
     """How good the simulated SLAM is; what is left out depends on its kind."""
 
     kind: Kind = "tracked"
-    """Which SLAM is simulated: tracked, whose errors are those of a real one, or independent, a stress test with many
-    points, each wrong on its own."""
+    """Which SLAM is simulated: tracked errs as a real one does (short tracks, errors that neighbouring points share),
+    independent is a stress test with many points, each wrong on its own."""
     keyframe_every: int | None = None
-    """Number of frames from one keyframe to the next; left out, 10 to 20, drawn (tracked), or 2 (independent). More
-    make fewer keyframes."""
+    """Number of frames from one keyframe to the next; left out, drawn from 10 to 20 each time (tracked), or 2
+    (independent). More make fewer keyframes."""
     maps: int = 2
-    """Number of submaps that the keyframes are divided among. More make shorter submaps."""
+    """Number of submaps, each a stretch of the path with a scale and origin of its own. More make shorter submaps."""
     shared_keyframes: int = 2
-    """Number of keyframes that a submap shares with the one before it. More make submaps easier to join."""
+    """Number of keyframes at its beginning that a submap has in common with the one before it. More make submaps easier
+    to join."""
     points_per_keyframe: int | None = None
     """Largest number of points that each keyframe observes (tracked; left out, 250 to 1500, drawn for each submap) or
-    makes anew (independent; left out, 250). More make a denser map."""
+    adds to those before (independent; left out, 250). More make a denser map."""
     spurious: float | None = None
-    """Share of the map points that are wrong; left out, 0.03 (tracked) or 0.3 (independent). A larger one makes the
-    map harder to densify."""
+    """Share of the map points, in [0, 1), that are wrong: at least 1.3 times too far, or with tracked also too near;
+    left out, 0.03 (tracked) or 0.3 (independent). A larger one makes the map harder to densify."""
     point_noise: float | None = None
-    """Error of a point's distance, as a share of it; left out, 0.035 (tracked: the median of its size) or 0.01
-    (independent: the deviation at 20 mm; it grows in proportion to the distance, so the error with its square). A
-    larger one makes a noisier map."""
+    """Error of the other points' distance, as a share of it: the median size (tracked; left out, 0.035), or the
+    standard deviation at 20 mm, in proportion more farther off (independent; left out, 0.01). A larger one makes a
+    noisier map."""
     shared_noise: float = 0.3
-    """Share of the variance of that error that neighbouring points have in common, of tracked ones. A larger one
-    makes whole pieces of wall wrong together."""
+    """Share, in [0, 1], of the variance of point_noise that neighbouring points have in common; only with tracked. A
+    larger one makes whole pieces of wall wrong together."""
     shared_length_mm: float = 6.0
-    """Distance within which points are neighbours in that sense, mm: they share exp(-1/2) of it. A larger one makes
-    larger pieces."""
+    """Distance, mm, at which the error that points have in common (shared_noise) is still correlated by 0.6; only with
+    tracked. A larger one makes larger pieces of wall wrong together."""
     drift: float | None = None
-    """Change of a submap's scale along its path, as a share, growing or shrinking; left out, 0.04 (tracked) or 0
-    (independent). A larger one makes one end of the map larger than the other."""
+    """Change of a submap's scale from one end of its path to the other, as a share, at random growing or shrinking;
+    left out, 0.04 (tracked) or 0 (independent). A larger one makes the two ends more unlike in size."""
     pixel_noise: float = 0.5
-    """Deviation of where a point is observed in the image along each axis, pixels. A larger one makes noisier
-    observations."""
+    """Standard deviation of the error of where a point is observed in the image, along each axis, pixels. A larger one
+    makes noisier observations."""
     pose_noise_mm: float = 0.05
-    """Deviation of a keyframe's place along each axis, mm. A larger one makes noisier poses."""
+    """Standard deviation of the error of a keyframe's place, along each axis, mm. A larger one makes noisier poses."""
     pose_noise_deg: float = 0.05
-    """Deviation of a keyframe's rotation about each axis, degrees. A larger one makes noisier poses."""
+    """Standard deviation of the error of a keyframe's rotation, about each axis, degrees. A larger one makes noisier
+    poses."""
 
 
 class _Settings(NamedTuple):

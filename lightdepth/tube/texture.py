@@ -16,31 +16,34 @@ class TextureConfig:
     """Ranges of the wall's appearance."""
 
     hue: tuple[float, float] = (-0.03, 0.06)
-    """Ends of the range of the wall's hue, turns of the colour circle; 0 is red. A larger one is more orange."""
+    """Ends of the range of the wall's hue, turns of the colour circle: 0 is red, 0.08 orange, below 0 a bluish red. A
+    larger one is more orange."""
     saturation: tuple[float, float] = (0.3, 0.65)
     """Ends of the range of the wall's saturation, a share in [0, 1]. A larger one makes deeper colours."""
     mottling: tuple[float, float] = (0.02, 0.08)
-    """Ends of the range of the deviation of saturation over the wall, a share. A larger one makes a more mottled
-    wall."""
+    """Ends of the range of the standard deviation of saturation from place to place, saturation being a share in [0,
+    1]. A larger one makes a more mottled wall."""
     value: tuple[float, float] = (0.0, 0.12)
-    """Ends of the range of how much darker the darkest spots are, a share, which LightDepth assumes to be 0. A larger
-    one breaks that assumption more."""
+    """Ends of the range of how much darker the darkest spots of the wall are than the brightest, a share of brightness;
+    depth from light assumes 0. A larger one breaks that assumption more."""
     vessels: tuple[int, int] = (10, 45)
-    """Least and largest number of stems of vessels, each of which branches. More give the wall more texture."""
+    """Least and largest number of stems of blood vessels, each of which branches. More give the wall more texture."""
     resolution: float = 0.14
-    """Size of a texel along the tube, mm. A larger one makes coarser paint, sooner."""
+    """Size of a texel, the pixel of the wall's paint, mm. A larger one makes coarser paint, sooner."""
     vessel_width: tuple[float, float] = (0.25, 0.7)
     """Ends of the range of the width of a vessel's stem, mm. A larger one makes thicker vessels."""
     vessel_value: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of how much darker vessels are than the wall, a share. A larger one makes darker vessels."""
+    """Ends of the range of how much darker vessels are than the wall, a share of brightness, on top of up to 25 % where
+    scene.texture.value is above 0. A larger one makes darker vessels."""
     vessel_strength: tuple[float, float] = (1.0, 1.0)
-    """Ends of the range of a factor on how well vessels show. A larger one makes them plainer."""
+    """Ends of the range of a factor on how strongly vessels are painted, in colour and darkness; 0 hides them. A larger
+    one makes them plainer."""
     blotches: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of how much more saturated inflamed patches are, a share. A larger one makes redder patches;
-    (0, 0) makes none."""
+    """Ends of the range of how much more saturated inflamed patches are than the wall, a share. A larger one makes
+    redder patches; (0, 0) makes none."""
     speckle: tuple[float, float] = (0.0, 0.0)
-    """Ends of the range of the deviation of saturation at the scale of mucosal pits, 0.3 mm, a share. A larger one
-    makes a grainier wall."""
+    """Ends of the range of the standard deviation of saturation, a share, between grains about 0.3 mm wide, as mucosal
+    pits are. A larger one makes a grainier wall; (0, 0) makes none."""
 
 
 def make_texture(length: float, circumference: float, config: TextureConfig, rng: np.random.Generator) -> np.ndarray:

@@ -20,40 +20,48 @@ class AdaptConfig:
     """What of the network learns, from what, and for how long."""
 
     steps: int = 300
-    """Number of training steps. More adapt further and take longer."""
+    """Number of training steps. More move the network further from the checkpoint, for better or worse, and take
+    longer."""
     learning_rate: float = 5e-4
-    """Rate of learning at the top of its one cycle, a number above 0. A higher one learns faster, and less
-    steadily."""
+    """Highest learning rate, above 0, which training climbs to and then falls from. A larger one changes the weights
+    more in every step: the network learns faster, and less steadily."""
     batch_size: int = 4
-    """Number of frames in a step. More make steadier steps and take more time and memory."""
+    """Number of frames in a batch, from which each step learns. More make steadier steps and take more time and
+    memory."""
     size: tuple[int, int] | None = None
-    """Width and height that the network learns at, pixels; left out, the rows of the checkpoint. A larger one shows
-    finer detail and takes longer."""
+    """Width and height that images are resized to for training, pixels; left out, the height that the checkpoint was
+    trained at, and the width that goes with it. A larger one shows finer detail and takes longer."""
     what: What = "all"
-    """Which part of the network learns: all, decoder, norms (scale and shift of the normalisations) or low_rank."""
+    """Which weights learn: all (but those of the uncertainty head); decoder, all behind the part that reads the image;
+    norms, only scale and shift of the normalisations; low_rank, a small addition to each layer (see --rank). The fewer
+    learn, the less can change."""
     rank: int = 4
-    """Number of ranks of what low_rank adds to every convolution. More let it change further."""
+    """Number of ranks (independent directions) of what --what low_rank adds to each layer; without that it has no
+    effect. More let the network change further."""
     anchor: float | None = None
-    """Weight that holds the shape of each distance map to what the checkpoint said before; left out, half of that of
-    the map's points; where none teach, 0 under true distance and else 20. A larger one holds it more firmly."""
+    """Weight that holds the shape of each distance map to what the checkpoint gave before; 0 lets go. Left out, half of
+    --points where a map teaches and something judges; else 0 where true distance judges, and 20 where it does not. A
+    larger one holds it more firmly."""
     replay: int = 0
-    """Number of synthetic colons of the kind that the checkpoint learned from, which fill half of each batch; 0 for
-    none. More show more variety and take longer to render."""
+    """Number of synthetic colons of the kind that the checkpoint was trained on, whose frames fill half of each batch,
+    so that what it knew is not lost; 0 for none. More show more variety and take longer to render."""
     points: float | None = None
-    """Weight of the map's points as teachers; left out, 100 where there is a map. Those that a held-out frame saw, and
-    a fifth of the others in whole blocks of wall, only judge. A larger one follows the points more closely."""
+    """Weight of the map's points as teachers of distance (up to one factor per image); left out, 100 where there is a
+    map; 0, they teach nothing. Points that a held-out frame saw, and a fifth of the others in whole blocks of wall,
+    only judge. A larger one follows the points more closely."""
     overlap: float = 0.0
-    """Weight of the places where two keyframes of the map see the same tissue. A larger one makes their depths agree
-    better."""
+    """Weight of the term that makes the distances of two of the map's keyframes agree where both see the same wall; 0
+    leaves it out. A larger one makes them agree better. Above 0 it needs a map, given or made."""
     judge: Literal["auto", "none"] = "auto"
-    """What judges besides the loss: auto, true distance or a map, and where there is neither a map is made of the
-    frames; none makes no map, so that without truth and --map nothing judges."""
+    """What tells whether the adapted network is better: auto takes true distance where the frames have it, else the map
+    of --map, else one that is made of the frames. none does the same but makes no map, so that without truth and --map
+    nothing judges."""
     held_out: float = 0.2
-    """Share of each sequence, at its end, that judges and is never trained on. A larger one judges more surely and
-    trains on less."""
+    """Share of each sequence, above 0 and below 1, at its end, that judges and is never trained on. A larger one judges
+    more surely and trains on less."""
     seed: int = 0
-    """Number that draws order, augmentation, replayed colons and low-rank additions. Another one makes another
-    run."""
+    """Number that all chance follows from: order of frames, augmentation, replayed colons, blocks of wall that judge,
+    the beginning of low_rank. Another one makes another run, better or worse by chance alone."""
 
     def __post_init__(self) -> None:
         if min(self.steps, self.batch_size) < 1 or not self.learning_rate > 0 or self.replay < 0:

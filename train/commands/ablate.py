@@ -41,17 +41,22 @@ def ablate(
     """What each ingredient of a training preset is worth: leave them out one by one, train, and compare.
 
     Args:
-        output: Run folder; rows that are already in it, made with the same settings, are kept.
-        base: Training preset that all rows start from, a YAML file; a row's own preset, where it has one, replaces its
-            model part.
-        settings: Dotted options of `train` and their values, changed for all rows.
-        rows: Trainings to compare; the first is what the others are compared with (configs/ablation/lightdepth.yaml
-            has some).
-        judged: Colons to judge on, which no row is trained on.
-        seeds: Numbers that draw colons, weights and order, one training of each row for each. More make the
-            comparison more certain and take longer.
-        table: Markdown file to write a copy of the table to.
-        overwrite: Make all rows anew, whatever is there.
+        output: Run folder, with the table (ablation.md). Trainings already in it are kept where their settings are the
+            same, so that a broken-off run goes on.
+        base: YAML file of options of `train` that the training of every row starts from; --settings and the row's own
+            come on top, and a row's own preset replaces its model part. Another file compares changes to another
+            training.
+        settings: Options of `train` by their dotted names, with values, such as {trainer.max_steps: 300}, which all
+            rows have in place of those of --base; a row's own win over them.
+        rows: Trainings to compare, best given in a --config file: a list with name, settings and more for each, as
+            configs/ablation/lightdepth.yaml has it. The first is what the others are compared with.
+        judged: Synthetic colons whose depth errors all rows are judged by, and on which none is trained; best given in
+            a --config file: a list with name, make, strength, first and count for each, as
+            configs/ablation/lightdepth.yaml has it.
+        seeds: Numbers that colons, first weights and order of frames follow from; each row is trained once with each of
+            them. More make the comparison more certain and take longer.
+        table: Markdown file to which a copy of the table is written. Left out, it is in the run folder only.
+        overwrite: Train all rows anew, also those already in the run folder. Without it, these are kept.
     """
     started = time.time()
     arguments = recorded(

@@ -52,16 +52,21 @@ def adapt(
     """Adapt a checkpoint to another endoscope or organ, from frames without truth.
 
     Args:
-        output: Run folder to make, with the adapted model and a report.
-        checkpoint: Model to start from: a path, or the name of a bundled one.
-        more: Other sequences of the same endoscope to learn from, such as '[A, B]'.
-        map: Sparse map of the frames; its points find the light where nobody gave it, teach, and judge the result. Left
-            out, pycolmap makes one of frames without truth.
-        fit_light: Where nobody gave the light, fit it on the map and use it if hidden blocks of wall agree.
+        output: Run folder to make, with the adapted model, if it was found better, and a report (report.html).
+        checkpoint: Trained model to start from: a path (.safetensors or .ckpt), or the name of a bundled one
+            (lightdepth-synthetic or lightdepth-self).
+        more: Folders of other sequences of the same endoscope to learn from as well, such as '[A, B]'; they are read
+            with the camera, light and mask of DATA. They do not judge.
+        map: Sparse map of the frames (a SLAM export or a COLMAP model); its points tell the light where nobody gave it,
+            teach, and judge the result. Left out, pycolmap makes one where there is no true distance, or where --points
+            or --overlap is given, but none with --judge none.
+        fit_light: true: where no light was given, it is fitted on the map, and used if hidden blocks of wall agree with
+            it. false: the light of the frames, or an assumed one, is taken as it is.
         sfm: how frames are mapped when there is neither truth nor map
-        keep_worse: Write the model even where its judge finds it not better, or it became too unsteady. Where nothing
-            judges, it is written anyway unless it became too unsteady.
-        overwrite: Replace a run made before.
+        keep_worse: true: the model is written even where its judge does not find it better. false: then no model is
+            written. Where nothing judges, it is written in either case, but with false only if its answers stayed as
+            steady as before (in mirrored, darker images).
+        overwrite: Replace a run made before. Without it, a folder that is already there is refused.
     """
     if map is None and config.taught and config.judge == "none":
         raise InputError(

@@ -75,17 +75,24 @@ def select(
     """The frames worth training on, by covisibility: not blur, water, stool, nor walls too near.
 
     Args:
-        data: Folder of frames, or video, to choose from.
-        output: List to write, with a table (.csv), a contact sheet (_contact.png) and a page (.html) beside it.
-        map: Sparse map, COLMAP model(s) or a multi-map tree, whose covisibility decides instead of matching images.
-        matcher: What matches images: sift, or loftr, which needs --loftr.weights.
-        format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
-            looking if left out.
-        camera: Calibration file, which wins over the folder's own; left out, the folder's, else the map's.
-        mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
-        with_folder: Write names as folder/name, so that lists of several sequences can be joined.
-        no_frames: Leave the pictures of frames out of the page.
-        overwrite: Replace files that an earlier run made.
+        data: Folder of frames, or a video, to choose from.
+        output: Text file to write with the names of the kept frames, one a line; beside it come a table of all frames
+            (.csv), a sheet of pictures (_contact.png) and a page (.html).
+        map: Sparse map of the frames (a SLAM export or a COLMAP model): which keyframes see the same wall (are
+            covisible) is then read from it, by --map_rules, and no images are matched.
+        matcher: What matches images where there is no --map: sift, by single features; loftr, by a network, which finds
+            matches on smoother tissue, takes longer and needs --loftr.weights. Its options begin with its name.
+        format: Format of the frames: folder (images with camera.json), video, or the data set c3vd, simcol, hamlyn,
+            scared, endoslam or endomapper. Left out, it is told by the files.
+        camera: Calibration file of the camera, used instead of the folder's own; left out, the folder's, else the
+            map's.
+        mask: Image, white where tissue shows and black elsewhere, used instead of the folder's own mask. Left out, the
+            folder's own, where it has one, else the whole image.
+        with_folder: true: names are written as folder/name, so that lists of several sequences can be joined. false: as
+            name alone.
+        no_frames: Leave out all pictures: the sheet is not written, and the page has none. Without it, both show
+            frames.
+        overwrite: Replace the files of an earlier run. Without it, files that are already there are refused.
     """
     paths = _paths(output, no_frames, overwrite)
     sparse_map = read_map(map) if map is not None else None

@@ -33,27 +33,35 @@ class NodeRules:
     """When a frame belongs to a node, and which nodes are kept."""
 
     similarity: float = 0.98
-    """Cosine to a view of the node above which a frame counts as alike, and is not matched. A higher one matches more
-    frames and takes longer."""
+    """Likeness of two frames, a cosine up to 1 (the same), above which a frame joins the present node without being
+    matched (a node is a run of frames that see the same wall). A higher one matches more frames and takes longer."""
     min_matches: int = 15
-    """Number of matches above which two frames are covisible. More keep fewer frames."""
+    """Number of matches above which two frames count as covisible, that is as seeing the same wall. More keep fewer
+    frames."""
     min_spread: float = 0.2
-    """Least share of the image's cells that the matches must lie in. A larger one keeps fewer frames."""
+    """Least share of the image (of the cells of an 8 x 8 grid) in which the matches of two covisible frames must lie; 0
+    asks for none. A larger one keeps fewer frames."""
     min_views: int = 3
-    """Least number of views of a node that is kept. More keep fewer frames."""
+    """Least number of views that a node must have for its frames to be kept (a node is a run of frames that see the
+    same wall; its views are those that further frames are matched with). More keep fewer frames."""
     max_skipped: int = 1
-    """Largest number of alike frames in a row that are not matched; the next is matched all the same. More take less
-    time and notice changes later."""
+    """Largest number of frames in a row that are taken for the same wall by `similarity` alone, without being matched;
+    0 matches every frame. More take less time and notice changes later."""
     min_frames: int = 1
-    """Least number of frames from one view of a node to the next; a covisible frame that comes sooner belongs to the
-    node, but is no view. More thin the views out."""
+    """Least number of frames from one view of a node to the next (a node is a run of frames that see the same wall; its
+    views are those that further frames are matched with). More make fewer views, so that fewer nodes reach
+    min_views."""
     max_views: int = 29
-    """Number of views above which a node is closed. More make longer nodes."""
+    """Number of views above which a node ends and the next frame begins another (a node is a run of frames that see the
+    same wall; its views are those that further frames are matched with). More make longer nodes."""
     reference: Literal["last", "middle"] = "last"
-    """Which view of a node frames are matched with: its last or its middle one."""
+    """Which view of a node a new frame is matched with (a node is a run of frames that see the same wall): last, the
+    newest, so that a node may move along the wall; middle, an older one, so that a node ends sooner as the camera moves
+    on."""
     blur: float = 0.5
-    """Share of the kept frames' median number of features below which a frame is blur, and rejected whatever it
-    matches: moved or out of focus alike, such frames match each other. A larger one rejects more frames."""
+    """Share of the median number of features of the kept frames, below which a frame is rejected as blurred, even where
+    it matches others; 0 rejects none. A larger one rejects more frames. With the loftr matcher, which has no features
+    to count, it has no effect."""
 
     def __post_init__(self) -> None:
         if min(self.min_views, self.min_frames, self.max_views) < 1 or min(self.min_matches, self.max_skipped) < 0:
@@ -217,15 +225,17 @@ class MapRules:
     """Which frames a sparse map vouches for."""
 
     points: int = 15
-    """Number of points in common from which two keyframes are covisible. More keep fewer frames."""
+    """Number of map points that two keyframes must both see to count as covisible (seeing the same wall). More keep
+    fewer frames."""
     keyframes: int = 2
-    """Least number of covisible others that a keyframe must have to be kept. More keep fewer frames."""
+    """Least number of other keyframes that a keyframe must be covisible with (see the same wall as) to be kept. More
+    keep fewer frames."""
     between: int = 40
-    """Largest difference of frame numbers (those in the names) between two kept, covisible keyframes that follow each
-    other for the frames between them to be kept; 1 keeps keyframes only. More keep more frames."""
+    """Largest difference of the numbers (in file names) of two kept keyframes that follow each other and are covisible,
+    for the frames between them to be kept as well; 1 keeps keyframes only. More keep more frames."""
     published: bool = True
-    """Whether the pairs of camerasModel.txt (EndoMapper) are taken, where it is beside the model, instead of
-    `points`."""
+    """true: where camerasModel.txt (EndoMapper) lies beside the map, it says which keyframes are covisible, and
+    --map_rules.points is not asked. false: the points always say it."""
 
     def __post_init__(self) -> None:
         if min(self.points, self.keyframes, self.between) < 1:

@@ -49,27 +49,28 @@ class SiftSettings:
     """Features and their geometry."""
 
     width: int = 480
-    """Width at which images are matched, pixels; smaller ones are matched at their own. A larger one finds finer
+    """Width that images are reduced to for matching, pixels; smaller ones stay as they are. A larger one finds finer
     features and takes longer."""
     features: int = 800
-    """Largest number of features in a frame. More find more matches and take longer."""
+    """Largest number of features taken of a frame, the strongest ones. More find more matches and take longer."""
     contrast: float = 0.02
-    """Contrast of the weakest feature, in [0, 1]: SIFT's contrast threshold. A higher one finds fewer features."""
+    """Least contrast of a feature, with brightness in [0, 1] (OpenCV's contrastThreshold). A higher one finds fewer,
+    more distinct features."""
     largest: float = 0.02
-    """Size of the largest feature, as a share of the width; larger ones survive blur and tell nothing of sharpness. A
-    larger one takes in more features."""
+    """Largest size of a feature, as a share of the image's width: larger ones survive blur, and would let blurred
+    frames pass. A larger one takes in more features."""
     ratio: float = 0.8
-    """Largest ratio of the distance to the best match to that to the second best. A larger one takes in more matches,
-    wrong ones among them."""
+    """Largest ratio, up to 1, of the difference between a feature and its best match to that between it and its second
+    best, for the match to count. A larger one takes in more matches, wrong ones among them."""
     angle: float = 0.5
-    """Largest angle of a match to its epipolar plane, degrees. A larger one takes in more matches, wrong ones among
-    them."""
+    """Largest angle, degrees, by which a match may miss the plane in which the camera's motion lets it lie (its
+    epipolar plane). A larger one takes in more matches, wrong ones among them."""
     highlight: float = 0.95
-    """Brightness, in [0, 1], above which all channels of a highlight are, which holds no features. A higher one takes
-    fewer pixels for highlights."""
+    """Brightness, in [0, 1], above which red, green and blue must all be for a pixel to be a highlight, where no
+    feature is taken. A higher one takes fewer pixels for highlights."""
     border: float = 0.01
-    """Width of the strip along the mask and around highlights that holds no features, as a share of the image's
-    width. A larger one leaves out more of the image."""
+    """Width of the strip inside the border of the visible image and around highlights where no feature is taken, as a
+    share of the image's width. A larger one leaves out more of the image."""
 
 
 @dataclass(frozen=True)
@@ -173,15 +174,16 @@ class LoftrSettings:
     """LoFTR as ColonMapper runs it: grey, half size, masked."""
 
     weights: Path | None = None
-    """File with LoFTR's weights (.ckpt, .pth or .safetensors), e.g. kornia's loftr_outdoor.ckpt; nothing is
-    downloaded."""
+    """File with LoFTR's weights (.ckpt, .pth or .safetensors), such as kornia's loftr_outdoor.ckpt; --matcher loftr
+    needs it, and nothing is downloaded."""
     width: int = 720
-    """Width at which images are matched, pixels; smaller ones are matched at their own. A larger one finds finer
+    """Width that images are reduced to for matching, pixels; smaller ones stay as they are. A larger one finds finer
     matches and takes longer."""
     confidence: float = 0.4
-    """Least confidence of a match, a share in [0, 1]. A higher one takes in fewer matches."""
+    """Least confidence of a match that counts, a share in [0, 1], as LoFTR gives it. A higher one takes in fewer, surer
+    matches."""
     device: str = "cpu"
-    """Where the matcher runs, by PyTorch's name, e.g. cpu or cuda."""
+    """Where the loftr matcher runs, by PyTorch's name: cpu, or cuda for a GPU, which is faster."""
 
 
 @dataclass(frozen=True)

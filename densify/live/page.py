@@ -1,0 +1,62 @@
+"""The report of a played sequence: the verdict, agreement with the map ahead, and where the time went."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from densify.judging.ahead import Ahead, running
+from densify.judging.verdict import Verdict
+from densify.live.play import Played
+from lightdepth.reporting.figures import chart, chart_png
+from lightdepth.reporting.report import Report
+
+
+def live_page(verdict: Verdict | None, judged: Mapping[int, Ahead], played: Sequence[Played], timings: bytes) -> Report:
+    """The whole page; `judged` by map, empty where nothing was, `timings` the picture of them (PNG)."""
+    page = Report("Live surfaces")
+    if verdict is not None:
+        page.text(f"Verdict: {verdict}.")
+        _agreement(page, judged, played)
+    page.heading("Time")
+    page.wide_figures([(timings, "What each keyframe's time went into")])
+    return page
+
+
+def _agreement(page: Report, judged: Mapping[int, Ahead], played: Sequence[Played]) -> None:
+    page.heading("Agreement with the map ahead")
+    page.text(
+        "How far the depth of the last aligned keyframe is from points that the map measured after it, as a share, in "
+        "the median. This is agreement, not error: map and surface may have drifted together. New points lie beside "
+        "points that were used, at the rim of what was known. A constant distance gets the same help, one scale or a "
+        "bend, and is asked at the same points."
+    )
+    rows = []
+    for number, found in judged.items():
+        c = found.columns
+        ways = [c.one_scale, c.bent, c.constant_one_scale, c.constant_bent]
+        rows.append([f"map {number}", c.count, found.number, *ways])
+    headers = ["", "new points", "as fused", "one scale", "bent", "constant, one scale", "constant, bent"]
+    page.table(headers, rows)
+    for number, found in judged.items():
+        page.text(f"Map {number}: {found.verdict}.")
+    page.wide_figures(
+        [(_running_picture(judged, played), "The same while the surfaces grew: medians up to each keyframe")]
+    )
+
+
+def _running_picture(judged: Mapping[int, Ahead], played: Sequence[Played]) -> bytes:
+    figure, axes = chart((9.0, 2.6))
+    place = np.arange(len(played))
+    for count, number in enumerate(judged):
+        rows = np.array([p.map == number for p in played])
+        medians = 100 * running([p.ahead for p in played if p.map == number])
+        for column, (color, label) in enumerate((("#2a6f97", "as fused"), ("#b8b8b8", "constant distance"))):
+            axes.plot(place[rows], medians[:, column], color=color, label=None if count else label)
+    axes.set_xlim(-0.5, len(played) - 0.5)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("keyframe")
+    axes.set_ylabel("off by [%]")
+    axes.legend(frameon=False, fontsize=8)
+    return chart_png(figure)
