@@ -192,7 +192,7 @@ class DenseMap(Brief):
         write_tum(folder / "trajectory.tum", [float(k.number) for k in self.submap.keyframes], poses)
 
     def _write_keyframes(self, path: Path, scale: float) -> None:
-        with path.open("w", newline="") as file:
+        with path.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
             table = csv.writer(file)
             columns = ["keyframe", "frame", "ok", "scale", "sigma", "points", "inliers", "inlier_share"]
             table.writerow([*columns, *Contribution.__dataclass_fields__, "reason"])

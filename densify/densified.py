@@ -166,7 +166,7 @@ class Densified:
         run.record["uncertainty"] = {"sentence": self.of_uncertainty, **({} if found is None else found.record())}
         if found is not None and found.predicted.ok:
             told = {"checkpoint": self.model, "factor": found.predicted.factor, **found.record()}
-            (run.folder / FILE).write_text(json.dumps(plain(told), indent=2) + "\n")
+            (run.folder / FILE).write_text(json.dumps(plain(told), indent=2) + "\n", encoding="utf-8")
 
     def _say_if_few(self, run: Run) -> None:
         """Surfaces of a map of which most keyframes could not be aligned are written, but part of the work failed."""

@@ -55,13 +55,16 @@ class TruthSource:
     mask: Path | None = None
     """Image, white where tissue shows and black elsewhere: only there is judged; left out, the truth folder's own mask,
     where it has one."""
+    bit_depth: int | None = None
+    """Bits of a sample in the truth's pictures that are stored in more than 8; left out, what the files say, else what
+    their highest values show. A larger one reads the same numbers as darker."""
     truth_mesh: Path | None = None
     """Mesh file of the true surface, in mm and in the frame of the true poses; left out, C3VD's own where it lies
     beside the frames, else one made of true depth."""
 
     def sequence(self, folder: Path) -> SequenceSource:
         """A folder of the truth: itself, or one of its sequences."""
-        return SequenceSource(folder, self.format, self.camera, mask=self.mask)
+        return SequenceSource(folder, self.format, self.camera, mask=self.mask, bit_depth=self.bit_depth)
 
 
 @dataclass(frozen=True)

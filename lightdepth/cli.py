@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import io
 import sys
 from functools import partial
 from importlib import metadata, util
@@ -49,6 +50,9 @@ ORDER = (
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show ends no run
     with outliving_readers():
         return _main(sys.argv[1:] if argv is None else argv)
 
@@ -85,6 +89,12 @@ def _main(argv: list[str]) -> int:
     except PartialFailure as error:
         print(f"lightdepth {verb}: {error}", file=sys.stderr)
         return 4
+    except UnicodeEncodeError as error:  # libraries that know UTF-8 alone
+        if not any("\udc80" <= letter <= "\udcff" for letter in str(error.object)):
+            raise
+        name = str(error.object).encode("utf-8", "backslashreplace").decode()
+        print(f"lightdepth {verb}: {name[:300]}: a name that is not UTF-8; rename it", file=sys.stderr)
+        return 3
     except KeyboardInterrupt:
         print(f"lightdepth {verb}: interrupted", file=sys.stderr)
         return 130
@@ -159,7 +169,7 @@ def _summary(entry: metadata.EntryPoint) -> str:
     spec = util.find_spec(entry.module)
     if spec is None or spec.origin is None:
         return ""
-    for node in ast.parse(Path(spec.origin).read_text()).body:
+    for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8-sig")).body:
         if isinstance(node, ast.FunctionDef) and node.name == entry.attr:
             return (ast.get_docstring(node) or "").split("\n")[0]
     return ""

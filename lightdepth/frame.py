@@ -182,6 +182,15 @@ def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
 
 
+def resized_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A mask (H, W) bool at (width, height): of each new pixel, whether its centre lies in it. cv2.INTER_NEAREST takes
+    the pixel's corner in place of its centre, and so shifts a mask by half a pixel."""
+    import cv2
+
+    result: np.ndarray = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    return result
+
+
 @lru_cache(maxsize=16)
 def _merging(many: int, few: int) -> csr_matrix:
     """(few, many): each row the mean over an equal share of [0, many], parts of pixels included."""

@@ -295,12 +295,12 @@ def test_a_light_that_no_endoscope_has_is_doubted(tmp_path):
 def test_a_mask_that_is_inverted_or_masks_all_or_nothing_is_doubted():
     inside = np.zeros((80, 96), bool)
     inside[10:70, 10:86] = True
-    image = np.where(inside[..., None], 0.6, 0.02).astype(np.float32).repeat(3, -1)
+    image = np.where(inside[..., None], 0.6, 0.03).astype(np.float32).repeat(3, -1)
 
     def masked(mask: np.ndarray) -> list[Frame]:
         return [replace(f, image=image, mask=mask) for f in blank()]
 
-    says(masked(~inside), r"mask keeps the dark part of the image \(brightness 0\.02, 0\.60 outside\)")
+    says(masked(~inside), r"mask keeps the dark part of the image \(brightness 0\.03, 0\.60 outside\)")
     says(masked(np.ones_like(inside)), r"4\d% of the image is a black border, and the mask leaves it in")
     speck = np.zeros_like(inside)
     speck[40, 40:50] = True

@@ -358,9 +358,9 @@ def names_read(module: FrameDataModule, monkeypatch) -> tuple[set[str], set[str]
 
     original = folder.read_image
 
-    def spy(path):
+    def spy(path, white):
         read.add(f"{path.parent.parent.name}/{path.stem}")
-        return original(path)
+        return original(path, white)
 
     module.setup()
     monkeypatch.setattr(folder, "read_image", spy)

@@ -333,6 +333,8 @@ def write_images(folder: Path, image: np.ndarray, count: int = 12) -> Path:
 @pytest.mark.parametrize(("value", "said"), [(0, "100% black"), (255, "100% of the pixels are saturated")])
 def test_frames_without_a_usable_pixel_end_the_run_with_their_names(tmp_path, value, said):
     sequence = write_images(tmp_path / "seq", np.full((32, 40, 3), value, np.uint8))
+    if not value:  # where all are black, the sequence is refused before
+        cv2.imwrite(str(sequence / "frames" / "0011.png"), np.full((32, 40, 3), 100, np.uint8))
     with pytest.raises(InputError) as stopped:
         quick(tmp_path, "--fit.diagnosis.blind", "3", sequence=sequence)
     assert said in str(stopped.value) and f"{sequence}: 00" in str(stopped.value)

@@ -60,6 +60,9 @@ class FrameData:
     mask: str | None = None
     """Image, white where tissue shows and black elsewhere, for all the sequences in place of their own masks. Left out,
     each has its own, if any."""
+    bit_depth: int | None = None
+    """Bits of a sample in pictures that are stored in more than 8, of all the sequences; left out, what the files say,
+    else what their highest values show. A larger one reads the same numbers as darker."""
     held_out: float = 0.1
     """Share of each training sequence, above 0 and below 1, at its end, that validates and teaches nothing, where no
     validation sequences are given. A larger one judges more surely and trains on less."""
@@ -119,7 +122,7 @@ class FrameData:
         """How the sequence at `path` is read; `format` is that of its data set, where it is known."""
         camera, mask = (None if file is None else Path(file) for file in (self.camera, self.mask))
         known = cast("FormatName | None", format)  # dataset.yaml's is one of them: read_dataset_yaml looks
-        return SequenceSource(Path(path), self.format or known, camera, self.light, mask)
+        return SequenceSource(Path(path), self.format or known, camera, self.light, mask, self.bit_depth)
 
 
 class FrameDataModule(pl.LightningDataModule):
@@ -187,7 +190,7 @@ class FrameDataModule(pl.LightningDataModule):
     def _origin(self) -> tuple[object, ...]:
         """What the frames follow from."""
         c = self.config
-        read = (c.split, c.root, c.frames, c.format, c.camera, c.light, c.mask, c.held_out)
+        read = (c.split, c.root, c.frames, c.format, c.camera, c.light, c.mask, c.bit_depth, c.held_out)
         return (self.sequences, self.val_sequences, *read, c.tube, self.size, c.seed)
 
     def _folders(self) -> list[list[tuple[str, Listed | None]]]:

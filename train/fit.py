@@ -354,5 +354,5 @@ class _Echo:
         if not _first_process():
             return
         print(line, file=sys.stderr, flush=True)
-        with self.log.open("a") as file:
+        with self.log.open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(line + "\n")

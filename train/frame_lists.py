@@ -15,7 +15,7 @@ from lightdepth.errors import InputError
 def read_frame_list(path: Path) -> list[str]:
     """Frame names, one a line; empty lines and lines that start with # are skipped."""
     try:
-        lines = [line.strip() for line in path.read_text().splitlines()]
+        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()]
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             path,

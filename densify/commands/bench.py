@@ -104,7 +104,7 @@ def run(
         found = record(config, [cell.record() for cell in cells], seconds)
         _write_json(folder, "bench.json", found)
         text = "\n".join([*(t.markdown() for t in tables(found)), *(f"{note}\n" for note in notes(found))])
-        (folder.folder / "bench.md").write_text(text)
+        (folder.folder / "bench.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         folder.log(text)
 
 
@@ -170,10 +170,10 @@ def compare_estimators(
         data = {"kind": "estimators", "unit": unit, "config": asdict(config), "records": records, "notes": said}
         _write_json(folder, "estimators.json", data | {"versions": versions(), "revision": git_revision()})
         text = "\n".join([*(t.markdown() for t in estimators_tables(records)), *(f"{line}\n" for line in said)])
-        (folder.folder / "estimators.md").write_text(text)
+        (folder.folder / "estimators.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         (folder.folder / "estimators.png").write_bytes(estimators_picture(records))
         folder.log(text)
 
 
 def _write_json(run: Run, name: str, data: Mapping[str, object]) -> None:
-    (run.folder / name).write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+    (run.folder / name).write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -25,6 +25,7 @@ def sparse(
     format: FormatName | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
+    bit_depth: int | None = None,
     poses: str | None = None,
     repair: Path | None = None,
     sfm: SfmConfig = SfmConfig(),
@@ -40,6 +41,8 @@ def sparse(
             looking if left out.
         camera: Calibration file that wins over the folder's own.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
+        bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
+            their highest values show. A larger one reads the same numbers as darker.
         poses: Known poses of the frames: truth (those of the sequence), or a TUM file (world from camera) whose times
             are frame numbers, or seconds where the frames are stamped or --map-fps counts; only points are then found.
             Left out, poses are found as well.
@@ -50,7 +53,7 @@ def sparse(
     """
     if repair is not None and poses is not None:
         raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
-    source = SequenceSource(data, format, camera, mask=mask)
+    source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth)
     arguments = recorded(
         reading,
         output=output,
@@ -58,6 +61,7 @@ def sparse(
         format=format,
         camera=camera,
         mask=mask,
+        bit_depth=bit_depth,
         poses=poses,
         repair=repair,
         sfm=sfm,

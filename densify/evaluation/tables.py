@@ -270,7 +270,7 @@ def write_evaluations(
 ) -> str:
     """Everything, into the folder; the text of the tables."""
     record = metrics_record(found, withheld, sources)
-    (folder / "metrics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
+    (folder / "metrics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     results = {name: e.judged for name, e in found.items()}
     depth = {name: j for name, j in results.items() if isinstance(j, DepthJudged)}
     posed = {name: j for name, j in results.items() if isinstance(j, MapsJudged)}
@@ -283,16 +283,20 @@ def write_evaluations(
         tables.append(withheld_table(withheld))
     notes = _notes(results, None if sources is None else sources.gap)
     text = "\n".join([*(t.markdown() for t in tables), *notes])
-    (folder / "metrics.md").write_text(text.rstrip() + "\n")
+    (folder / "metrics.md").write_text(text.rstrip() + "\n", encoding="utf-8", errors="backslashreplace")
     comments = "".join(f"% {line}\n" for note in notes for line in note.splitlines() if line)
-    (folder / "metrics.tex").write_text("\n".join([comments, *(t.latex() for t in tables)]))
-    with (folder / "metrics.csv").open("w", newline="") as file:
+    (folder / "metrics.tex").write_text(
+        "\n".join([comments, *(t.latex() for t in tables)]), encoding="utf-8", errors="backslashreplace"
+    )
+    with (folder / "metrics.csv").open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
         csv.writer(file).writerows(long_rows(results))
     for name, evaluation in found.items():
         prefix = f"{name}_" if len(found) > 1 else ""
         if evaluation.curves:
             (folder / f"{prefix}cumulative_error.png").write_bytes(curve_picture(evaluation))
-            with (folder / f"{prefix}cumulative_error.csv").open("w", newline="") as file:
+            with (folder / f"{prefix}cumulative_error.csv").open(
+                "w", newline="", encoding="utf-8", errors="surrogateescape"
+            ) as file:
                 shares = np.stack(list(evaluation.curves.values()), 1)
                 rows = [[f"{v:.6g}" for v in (edge, *row)] for edge, row in zip(EDGES_MM, shares, strict=True)]
                 csv.writer(file).writerows([["error_mm", *evaluation.curves], *rows])

@@ -196,7 +196,7 @@ def write_timings(played: Sequence[Played], path: Path) -> None:
     """A table with a row for each keyframe; times in milliseconds, `cpu_…` of all threads together; `ahead` is the
     median share by which the depth before it was off at its new points, `ahead_constant` that of a constant distance.
     """
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
         table = csv.writer(file)
         steps = [f"{kind}{step}_ms" for kind in ("", "cpu_") for step in (*ALL_STEPS, "total")]
         table.writerow(

@@ -15,12 +15,19 @@ _library = get_loader("yaml")
 
 def read_settings(file: Path) -> Any:
     """What a file of settings holds. Raises OSError, UnicodeDecodeError or yaml.YAMLError."""
-    return with_words(yaml.safe_load(file.read_text(encoding="utf-8")))
+    return with_words(yaml.safe_load(file.read_text(encoding="utf-8-sig")))
 
 
 def use_words() -> None:
     """From here on jsonargparse reads its YAML so, too."""
-    set_loader("yaml", lambda text: with_words(_library(text)), exceptions=(yaml.YAMLError,))
+    set_loader("yaml", _loaded, exceptions=(yaml.YAMLError,))
+
+
+def _loaded(text: str) -> Any:
+    """What a word of the command line, or a file, means as YAML; the name of a file that is not UTF-8 means itself."""
+    if any("\udc80" <= letter <= "\udcff" for letter in text):
+        return text
+    return with_words(_library(text))
 
 
 def with_words(value: Any) -> Any:

@@ -26,6 +26,7 @@ def calibrate_light(
     format: FormatName | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
+    bit_depth: int | None = None,
     seed: int = 0,
     pairing: Group[PairingConfig] = PairingConfig(),
     overwrite: bool = False,
@@ -41,6 +42,8 @@ def calibrate_light(
             looking if left out.
         camera: Calibration file, which wins over all others; left out, the map's own camera, else the folder's.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
+        bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
+            their highest values show. A larger one reads the same numbers as darker.
         seed: Number that draws the bootstrap samples, which tell how sure the light is. Another one gives slightly
             different intervals.
         overwrite: Replace files that an earlier run made.
@@ -56,7 +59,7 @@ def calibrate_light(
     if made and not overwrite:
         raise InputError(made[0], "already there", "choose another -o, or give --overwrite")
     rng = np.random.default_rng(seed)
-    source = SequenceSource(data, format, camera, mask=mask)
+    source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth)
     if map is None:
         fit = fit_on_truth(source.open(), rng)
         what = f"{data}, frames with known depth"

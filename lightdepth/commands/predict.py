@@ -57,6 +57,7 @@ def predict(
         run.hash_inputs(data=source.data)
         if previews:
             (run.folder / "previews").mkdir()
+        nothing = 0
         for i in range(len(frames)):
             try:
                 frame = frames[i]
@@ -64,6 +65,7 @@ def predict(
                 run.fail(frames.names[i], str(error))
                 continue
             prediction = model(frame)
+            nothing += not prediction.valid.any()
             if factor is not None and prediction.uncertainty is not None:
                 prediction = replace(prediction, uncertainty=prediction.uncertainty * np.float32(factor))
             prediction.save(run.folder / f"{frame.name}.npz")
@@ -74,5 +76,7 @@ def predict(
             bar.advance()
         if len(run.record["failures"]) == len(frames):
             raise InputError(source.data, "no frame could be read", f"the first: {run.record['failures'][0]['reason']}")
+        if nothing:
+            run.warn(f"{nothing} of {len(frames)} frames have no valid pixel: they are black, or masked")
         run.record["checkpoint"] = model.name
         run.record["uncertainty_factor"] = factor

@@ -19,14 +19,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
-from lightdepth.datasets.sequence import FrameSequence, found_mask, numbered_files
+from lightdepth.datasets.sequence import FrameSequence, numbered_files
 from lightdepth.errors import InputError
-from lightdepth.files.images import read_image, to_bgr8
+from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.sparse_map import check_rigid
@@ -98,6 +97,8 @@ def read_c3vd(
     camera: CameraModel | None = None,
     light: PhotometricCalibration | None = None,
     mask: np.ndarray | None = None,
+    *,
+    bit_depth: int | None = None,
 ) -> FrameSequence:
     """Frames of a C3VD sequence, with distance and pose where the folder has them."""
     tree = _tree(path)
@@ -119,7 +120,7 @@ def read_c3vd(
             "expected a line for each frame, from frame 0",
         )
     if camera is None:
-        height, width = read_image(images[0]).shape[:2]
+        width, height = image_size(images[0])
         whole = tree.camera
         if abs(width / height / (whole.width / whole.height) - 1) > 0.01:
             raise InputError(
@@ -129,8 +130,6 @@ def read_c3vd(
                 "images with --camera FILE",
             )
         camera = whole.resized(width, height)
-    if mask is None:
-        mask = found_mask(images)
     ray_z = camera.rays()[0][..., 2]
     names = [f"{n:04d}{tree.suffix.removesuffix('.png')}" for n in numbers]
     return frames_of(
@@ -143,6 +142,8 @@ def read_c3vd(
         times=[number / 30.0 for number in numbers],
         poses=None if poses is None else poses[numbers],
         distance=lambda i: _DEPTH.distance(depth[numbers[i]], ray_z) if numbers[i] in depth else None,
+        bit_depth=bit_depth,
+        bordered=True,
     )
 
 
@@ -158,15 +159,15 @@ def write_c3vd(frames: Sequence[Frame], path: Path, tree: str = "v1") -> None:
     lines = []
     for frame in frames:
         stem = f"{frame.number:04d}"
-        cv2.imwrite(str(path / where.colour / f"{stem}{where.suffix}"), to_bgr8(frame.image))
+        write_image(path / where.colour / f"{stem}{where.suffix}", to_bgr8(frame.image))
         if frame.true_distance is not None:
             depth = frame.true_distance * frame.camera.rays()[0][..., 2]
             code = np.floor(65535 * np.clip(depth / FULL_SCALE_MM, 0, 1))
-            cv2.imwrite(str(path / where.depth / f"{stem}_depth.tiff"), code.astype(np.uint16))
+            write_image(path / where.depth / f"{stem}_depth.tiff", code.astype(np.uint16))
         if frame.true_world_from_cam is not None:
             lines.append(",".join(f"{v:.9g}" for v in frame.true_world_from_cam.T.ravel()))
     if lines:
-        (path / "pose.txt").write_text("\n".join(lines) + "\n")
+        (path / "pose.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _tree(path: Path) -> _Tree | None:
@@ -183,7 +184,7 @@ def _colour(path: Path, tree: _Tree) -> dict[int, Path]:
 def _read_poses(path: Path) -> np.ndarray:
     """(n, 4, 4) world_from_cam [mm], whichever way the lines were flattened."""
     try:
-        rows = np.loadtxt(path, delimiter=",", ndmin=2)
+        rows = np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(
             path, f"not a C3VD pose file ({error})", "expected 16 numbers a line separated by commas"

@@ -79,7 +79,7 @@ def read_dataset_yaml(path: Path) -> DatasetInfo:
 def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     """A YAML file of ours, read by a safe loader; InputError names the file, and the field or the line."""
     try:
-        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        data = yaml.load(path.read_text(encoding="utf-8-sig"), _Loader)
     except OSError as error:
         raise InputError(
             path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"

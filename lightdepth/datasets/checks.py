@@ -13,13 +13,14 @@ and the file's own does not.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lightdepth.camera import Brown, CameraModel, Pinhole
-from lightdepth.datasets.sequence import FrameSequence, border_mask
+from lightdepth.datasets.sequence import FrameSequence, border_mask, readable
+from lightdepth.datasets.shown import check_shown
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
@@ -43,7 +44,7 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
     Raises InputError where poses and truth contradict each other and another reading fits; warns of what is unlikely.
     A frame that cannot be read is left out: it is refused when it is asked for.
     """
-    frames = _readable(sequence, sequence.sampled)
+    frames = readable(sequence, sequence.sampled)
     if not frames:
         return sequence
     for message in (
@@ -56,6 +57,7 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
         *_comb_doubts(frames),
     ):
         warnings.warn(f"{sequence.source}: {message}", stacklevel=3)
+    check_shown(sequence, frames)
     for frame in frames:
         if frame.true_world_from_cam is not None:
             check_rigid(frame.true_world_from_cam, f"{sequence.source}: {frame.name}")
@@ -74,22 +76,12 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
 
 def unusable_truth(sequence: FrameSequence) -> list[str]:
     """Why nothing can be judged by the truth of a sequence: it contradicts its poses, or is not in millimetres."""
-    frames = _readable(sequence, sequence.sampled)
+    frames = readable(sequence, sequence.sampled)
     fit = _fit_of(sequence, frames) if frames else None
     return [
         *_unit_doubts(frames),
         *([_contradiction(fit)] if fit is not None and fit.error_as_given > CONTRADICTION else []),
     ]
-
-
-def _readable(sequence: FrameSequence, rows: Iterable[int]) -> list[Frame]:
-    frames = []
-    for i in rows:
-        try:
-            frames.append(sequence[i])
-        except InputError:
-            continue
-    return frames
 
 
 # ---- camera, light, mask, image
@@ -298,7 +290,7 @@ def _fit_of(sequence: FrameSequence, frames: Sequence[Frame]) -> Fit | None:
     if fit is not None or len(both) < 2:
         return fit
     following = {i + 1 for i in sequence.sampled if i + 1 < len(sequence)} - set(sequence.sampled)
-    neighbours = [*frames, *_readable(sequence, sorted(following))]
+    neighbours = [*frames, *readable(sequence, sorted(following))]
     fit = fitting_reading(neighbours)
     numbers = sorted(f.number for f in neighbours if f.true_world_from_cam is not None)
     if fit is None and 1 in np.diff(numbers):

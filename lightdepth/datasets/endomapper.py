@@ -18,17 +18,16 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.format import Format, checked_images, frames_of
-from lightdepth.datasets.sequence import FrameSequence, found_mask, list_images, no_images, read_mask
+from lightdepth.datasets.sequence import FrameSequence, list_images, no_images, read_mask
 from lightdepth.errors import InputError
-from lightdepth.files.images import read_image, to_bgr8
+from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.files.schema import read_json
-from lightdepth.frame import Frame, check_image_size, frame_number
+from lightdepth.frame import Frame, check_image_size, frame_number, resized_mask
 from lightdepth.maps import read_map
 from lightdepth.photometry import PhotometricCalibration
 
@@ -70,6 +69,8 @@ def read_endomapper(
     light: PhotometricCalibration | None = None,
     mask: np.ndarray | None = None,
     fps: float | None = None,
+    *,
+    bit_depth: int | None = None,
 ) -> FrameSequence:
     """Frames of extracted video, or of one cluster. What is given here wins over the files; time is (N - 1) / fps where
     `fps` (40 or 50 in the data set) is given or found. Raises InputError where no camera is found."""
@@ -79,7 +80,7 @@ def read_endomapper(
         images, own = _in_cluster(path, images)
         path = cluster[0]
         if camera is None and own is not None and images:
-            height, width = read_image(images[0]).shape[:2]
+            width, height = image_size(images[0])
             camera = at_size(own, width, height, images[0].name)
     if not images:
         raise InputError(f"{image_folder(path)}", f"{no_images(image_folder(path))}", "expected out1.png, out2.png")
@@ -90,7 +91,7 @@ def read_endomapper(
             "extract them so, or read them with --format folder",
         )
     numbers = checked_images(path, images)
-    height, width = read_image(images[0]).shape[:2]
+    width, height = image_size(images[0])
     if camera is None:
         file = calibration_file(path, GEOMETRY)
         if file is None:
@@ -105,12 +106,12 @@ def read_endomapper(
         light = PhotometricCalibration() if file is None else read_light(file)
     if mask is None:
         found = [f for f in (path / "mask.png", image_folder(path) / "mask.png") if f.is_file()]
-        mask = read_mask(found[0]) if found else found_mask(images)
-        if mask.shape != (height, width) and abs(mask.shape[1] / mask.shape[0] / (width / height) - 1) < 0.01:
-            mask = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        mask = read_mask(found[0]) if found else None
+        if mask is not None and abs(mask.shape[1] / mask.shape[0] / (width / height) - 1) < 0.01:
+            mask = resized_mask(mask, (width, height))
     fps = fps or _fps(path)
     times = None if fps is None else [(number - 1) / fps for number in numbers]
-    return frames_of(source, images, camera, light, mask, times=times)
+    return frames_of(source, images, camera, light, mask, times=times, bit_depth=bit_depth, bordered=True)
 
 
 # A map's camera wins: EndoMapper's own maps were made with other numbers than its calibrations
@@ -133,9 +134,9 @@ def write_endomapper(frames: Sequence[Frame], path: Path, endoscope: str = "00")
     write_camera(frames[0].camera, path / f"Endoscope_{endoscope}_{GEOMETRY}.xml")
     write_light(frames[0].light, path / f"Endoscope_{endoscope}_{PHOTOMETRY}.xml")
     if frames[0].mask is not None:
-        cv2.imwrite(str(path / "mask.png"), frames[0].mask.astype(np.uint8) * 255)
+        write_image(path / "mask.png", frames[0].mask.astype(np.uint8) * 255)
     for frame in frames:
-        cv2.imwrite(str(path / "img_train" / f"out{frame.number}.png"), to_bgr8(frame.image))
+        write_image(path / "img_train" / f"out{frame.number}.png", to_bgr8(frame.image))
 
 
 def _in_cluster(path: Path, images: list[Path]) -> tuple[list[Path], CameraModel | None]:
@@ -145,7 +146,7 @@ def _in_cluster(path: Path, images: list[Path]) -> tuple[list[Path], CameraModel
     model = cluster[0] / "sparse" / path.stem
     keyframes = read_map(model).submaps[0].keyframes if model.is_dir() else ()
     if path.suffix == ".txt":
-        names = path.read_text(errors="replace").split()
+        names = path.read_text(errors="replace", encoding="utf-8-sig").split()
         odd = [name for name in names if not re.fullmatch(r"(?:.*[/\\])?out\d+(?:\.\w+)?", name)]
         if odd or not names:
             raise InputError(

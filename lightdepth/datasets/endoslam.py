@@ -21,16 +21,15 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole, camera_from_params
 from lightdepth.datasets.format import Format, frames_of
-from lightdepth.datasets.sequence import FrameSequence, found_mask, list_images, numbered_files
+from lightdepth.datasets.sequence import FrameSequence, list_images, numbered_files
 from lightdepth.errors import InputError
-from lightdepth.files.images import read_image, to_bgr8
+from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame, frame_number
 from lightdepth.photometry import PhotometricCalibration
 
@@ -67,13 +66,15 @@ def read_endoslam(
     camera: CameraModel | None = None,
     light: PhotometricCalibration | None = None,
     mask: np.ndarray | None = None,
+    *,
+    bit_depth: int | None = None,
 ) -> FrameSequence:
     """Frames of a sequence, with poses where a renderer wrote them. There is no true depth."""
     folder = image_folder(path)
     images = [folder / name for name in _rendered(path).values()] or (list_images(folder) if folder.is_dir() else [])
     if not images:
         raise InputError(path, "no Frames/ with images in it, and no image_NNNN.png", "is it a sequence of EndoSLAM?")
-    height, width = read_image(images[0]).shape[:2]
+    width, height = image_size(images[0])
     if camera is None:
         file = camera_file(path)
         if file is None:
@@ -85,10 +86,9 @@ def read_endoslam(
             )
         camera = _read_calibration(file) if _simulated(path) else read_camera(file, (width, height))
     poses = _poses(path)
-    if mask is None:
-        mask = found_mask(images)
     of_images = [poses.get(frame_number(image.name)) for image in images]
-    return frames_of(path, images, camera, light or PhotometricCalibration(), mask, poses=of_images)
+    light = light or PhotometricCalibration()
+    return frames_of(path, images, camera, light, mask, poses=of_images, bit_depth=bit_depth, bordered=True)
 
 
 FORMAT = Format(
@@ -116,24 +116,25 @@ def write_endoslam(frames: Sequence[Frame], path: Path, simulated: bool = False)
     unit, between = (100, ";") if simulated else (1000, ",")
     lines = [between.join(("tX", "tY", "tZ", "rX", "rY", "rZ", "rW", "time(s)" if simulated else "time"))]
     for frame in frames:
-        cv2.imwrite(str(folder / f"image_{frame.number:04d}.png"), to_bgr8(frame.image))
+        write_image(folder / f"image_{frame.number:04d}.png", to_bgr8(frame.image))
         if frame.true_world_from_cam is not None:
             unity = _FLIP @ frame.true_world_from_cam @ _FLIP
             numbers = (*unity[:3, 3] / unit, *Rotation.from_matrix(unity[:3, :3]).as_quat(), frame.number / 30)
             lines.append(between.join(repr(float(v)) for v in numbers))
     fx, fy, cx, cy = camera.params
     if simulated:
-        (path / "info.txt").write_text("depth and trajectory in dm\n")
+        (path / "info.txt").write_text("depth and trajectory in dm\n", encoding="utf-8")
         (path / "calibration.txt").write_text(
-            f"fx: {fx!r}\nfy: {fy!r}\ncx: {cx!r}\ncy: {cy!r}\n\ncols: {camera.width}\nrows: {camera.height}\n"
+            f"fx: {fx!r}\nfy: {fy!r}\ncx: {cx!r}\ncy: {cy!r}\n\ncols: {camera.width}\nrows: {camera.height}\n",
+            encoding="utf-8",
         )
     else:
         place = path.resolve().parent / "Calibration"
         place.mkdir(exist_ok=True)
-        (place / "cam.txt").write_text(f"{fx!r},0,{cx - 0.5!r},0,{fy!r},{cy - 0.5!r},0,0,1\n")
+        (place / "cam.txt").write_text(f"{fx!r},0,{cx - 0.5!r},0,{fy!r},{cy - 0.5!r},0,0,1\n", encoding="utf-8")
     if len(lines) > 1:
         name = "trajectory.csv" if simulated else f"{path.name.lower()}_position_rotation.csv"
-        (poses / name).write_text("\n".join(lines) + "\n")
+        (poses / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _rendered(path: Path) -> dict[int, str]:
@@ -148,7 +149,7 @@ def _simulated(path: Path) -> bool:
 def _read_calibration(path: Path) -> CameraModel:
     """`fx: 1.0` and so on, a line each."""
     found = {}
-    for line in path.read_text(errors="replace").splitlines():
+    for line in path.read_text(errors="replace", encoding="utf-8-sig").splitlines():
         key, colon, value = line.partition(":")
         try:
             found[key.strip()] = float(value) if colon else 0.0
@@ -171,7 +172,7 @@ def _poses(path: Path) -> dict[int, np.ndarray]:
         info = path / "info.txt"
         if not file.is_file():
             return {}
-        if not info.is_file() or "dm" not in info.read_text(errors="replace").lower().split():
+        if not info.is_file() or "dm" not in info.read_text(errors="replace", encoding="utf-8-sig").lower().split():
             raise InputError(info, "does not say that lengths are in dm", f"restore it, or remove {file.name}")
     else:
         files = sorted((path / "Poses").glob("*.csv")) if _rendered(path) else []

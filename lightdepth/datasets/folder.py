@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
@@ -26,7 +25,7 @@ from lightdepth.datasets.sequence import (
     read_mask,
 )
 from lightdepth.errors import InputError
-from lightdepth.files.images import image_size, read_raw, to_bgr8
+from lightdepth.files.images import image_size, read_raw, to_bgr8, write_image
 from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
@@ -43,11 +42,13 @@ def read_folder(
     camera: CameraModel | None = None,
     light: PhotometricCalibration | None = None,
     mask: np.ndarray | None = None,
+    *,
+    bit_depth: int | None = None,
 ) -> FrameSequence:
     """Frames of a folder. What is given here wins over the files in it; without any camera it is refused."""
     images = list_images(image_folder(path))
     if not images:
-        raise InputError(path, f"{no_images(path)}", "expected frames such as 000123.png")
+        raise InputError(image_folder(path), no_images(image_folder(path)), "expected frames such as 000123.png")
     known = {frame_number(file.name) for file in (path / "truth" / "distance").glob("*.tiff")}
     checked_images(path, images, known)
     first = legible(images)
@@ -93,6 +94,7 @@ def read_folder(
         times=[clock.get(image.stem, time) for image, time in zip(images, of_name, strict=True)],
         poses=poses,
         distance=distance,
+        bit_depth=bit_depth,
     )
 
 
@@ -128,10 +130,10 @@ def write_folder(frames: Iterable[Frame], path: Path) -> None:
     poses, times, first = [], [], None
     for frame in frames:
         first = first or frame
-        cv2.imwrite(str(path / "frames" / f"{frame.name}.png"), to_bgr8(frame.image))
+        write_image(path / "frames" / f"{frame.name}.png", to_bgr8(frame.image))
         if frame.true_distance is not None:
             (path / "truth" / "distance").mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(path / "truth" / "distance" / f"{frame.name}.tiff"), frame.true_distance.astype(np.float32))
+            write_image(path / "truth" / "distance" / f"{frame.name}.tiff", frame.true_distance.astype(np.float32))
         if frame.true_world_from_cam is not None:
             poses.append(frame.true_world_from_cam)
             times.append(frame.time or 0.0)
@@ -140,21 +142,25 @@ def write_folder(frames: Iterable[Frame], path: Path) -> None:
     write_camera(first.camera, path / "camera.json")
     write_light(first.light, path / "light.json")
     if first.mask is not None:
-        cv2.imwrite(str(path / "mask.png"), first.mask.astype(np.uint8) * 255)
+        write_image(path / "mask.png", first.mask.astype(np.uint8) * 255)
     if poses:
         write_tum(path / "truth" / "poses.tum", times, poses)
 
 
 def write_times(path: Path, times: Mapping[str, float]) -> None:
     """times.csv: the time [s] of frames by name, to the microsecond."""
-    path.write_text("name,seconds\n" + "".join(f"{name},{time:.6f}\n" for name, time in times.items()))
+    path.write_text(
+        "name,seconds\n" + "".join(f"{name},{time:.6f}\n" for name, time in times.items()),
+        encoding="utf-8",
+        errors="surrogateescape",  # names of files that are not UTF-8 come back as they are
+    )
 
 
 def read_times(path: Path) -> dict[str, float]:
     """Times [s] of frames by name."""
     times = {}
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(path, f"cannot be read as times of frames ({error})", "expected lines NAME,seconds") from error
     for row, line in enumerate(lines[1:], 2):

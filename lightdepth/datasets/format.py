@@ -6,19 +6,40 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.sequence import FrameSequence, along_ray, check_one_size, read_code, warn_of_gaps
+from lightdepth.datasets.sequence import (
+    FrameSequence,
+    along_ray,
+    check_files,
+    check_one_size,
+    found_mask,
+    read_code,
+    warn_of_border,
+    warn_of_gaps,
+    warn_of_orientation,
+)
+from lightdepth.files.depths import white_of
 from lightdepth.files.images import read_image
 from lightdepth.frame import Frame, frame_number
 from lightdepth.photometry import PhotometricCalibration
 
-Reader = Callable[
-    [Path, CameraModel | None, PhotometricCalibration | None, np.ndarray | None],
-    FrameSequence,
-]
+
+class Reader(Protocol):
+    """Reads the frames of a folder."""
+
+    def __call__(
+        self,
+        path: Path,
+        camera: CameraModel | None = None,
+        light: PhotometricCalibration | None = None,
+        mask: np.ndarray | None = None,
+        *,
+        bit_depth: int | None = None,
+    ) -> FrameSequence: ...
 
 
 @dataclass(frozen=True)
@@ -34,7 +55,8 @@ class Format:
     has_camera: Callable[[Path], bool]
     """Whether a sequence brings a camera that wins over a map's."""
     read: Reader
-    """The frames of a folder; camera, light and mask win over the files in it where they are given."""
+    """The frames of a folder; camera, light and mask win over the files in it where they are given;
+    `bit_depth` is that of pictures of more than 8 bits, found by looking where it is left out."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +81,7 @@ class DepthCode:
 def checked_images(path: Path, images: Sequence[Path], depth: Container[int] | None = None) -> list[int]:
     """The frame numbers of a sequence's images. Raises InputError where their sizes differ; where `depth` holds the
     numbers of frames with depth, warns of the others."""
+    check_files(images)
     check_one_size(images)
     numbers = [frame_number(image.name) for image in images]
     if depth is not None:
@@ -77,15 +100,25 @@ def frames_of(
     times: Sequence[float | None] | None = None,
     poses: Sequence[np.ndarray | None] | np.ndarray | None = None,
     distance: Callable[[int], np.ndarray | None] | None = None,
+    bit_depth: int | None = None,
+    bordered: bool = False,
 ) -> FrameSequence:
     """The images as frames. Names (the files' stems where left out), times [s], poses and what reads the true distance
-    [mm] go by the image's place in the list."""
+    [mm] go by the image's place in the list. Without a mask the black border is found, and said unless the data set is
+    known to have one (`bordered`)."""
     called = [image.stem for image in images] if names is None else names
+    check_files(images)
+    white = white_of(images, bit_depth)
+    warn_of_orientation(path, images)
+    if mask is None:
+        mask = found_mask(images, white)
+        if mask is not None and not bordered:
+            warn_of_border(path, mask)
 
     def load(i: int) -> Frame:
         return Frame(
             called[i],
-            read_image(images[i]),
+            read_image(images[i], white),
             camera,
             light,
             mask,

@@ -15,15 +15,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
-from lightdepth.datasets.sequence import FrameSequence, found_mask, numbered_files
+from lightdepth.datasets.sequence import FrameSequence, numbered_files
 from lightdepth.errors import InputError
-from lightdepth.files.images import read_image, to_bgr8
+from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 
@@ -61,6 +60,8 @@ def read_hamlyn(
     camera: CameraModel | None = None,
     light: PhotometricCalibration | None = None,
     mask: np.ndarray | None = None,
+    *,
+    bit_depth: int | None = None,
 ) -> FrameSequence:
     """Frames of a rectified sequence, with distance where stereo matching measured it."""
     tree = _tree(path)
@@ -77,16 +78,15 @@ def read_hamlyn(
         file = camera_file(path)
         if not file.is_file():
             raise InputError(path, "no intrinsics.txt", "put the sequence's there, or give --camera FILE")
-        height, width = read_image(images[0]).shape[:2]
+        width, height = image_size(images[0])
         camera = read_camera(file, (width, height))
-    if mask is None:
-        mask = found_mask(images)
     ray_z = camera.rays()[0][..., 2]
 
     def distance(i: int) -> np.ndarray | None:
         return _CODE.distance(depth[numbers[i]], ray_z) if tree.measured and numbers[i] in depth else None
 
-    return frames_of(path, images, camera, light or PhotometricCalibration(), mask, distance=distance)
+    light = light or PhotometricCalibration()
+    return frames_of(path, images, camera, light, mask, distance=distance, bit_depth=bit_depth, bordered=True)
 
 
 FORMAT = Format(
@@ -105,11 +105,11 @@ def write_hamlyn(frames: Sequence[Frame], path: Path, tree: str = "rectified") -
         (path / folder).mkdir(parents=True)
     for frame in frames:
         file = path / where.colour / f"{frame.number:010d}.jpg"
-        cv2.imwrite(str(file), to_bgr8(frame.image), [cv2.IMWRITE_JPEG_QUALITY, 100])
+        write_image(file, to_bgr8(frame.image), quality=100)
         if frame.true_distance is not None:
             depth = np.rint(frame.true_distance * camera.rays()[0][..., 2])
             code = np.clip(depth, 0, 65535).astype(np.uint16)
-            cv2.imwrite(str(path / where.depth / f"{frame.number:010d}.png"), code)
+            write_image(path / where.depth / f"{frame.number:010d}.png", code)
     matrix = camera.matrix
     matrix[:2, 2] -= 0.5  # the file's first pixel has its centre at (0, 0)
     np.savetxt(path / "intrinsics.txt", matrix)

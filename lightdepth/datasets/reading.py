@@ -16,7 +16,7 @@ from lightdepth.datasets.format import Format
 from lightdepth.datasets.sequence import FrameSequence, legible, list_images, read_mask
 from lightdepth.datasets.video import VideoFile, read_video, video_at
 from lightdepth.errors import InputError
-from lightdepth.files.images import image_size, read_image
+from lightdepth.files.images import image_size
 from lightdepth.frame import check_image_size
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.which_frame import Stamps
@@ -35,17 +35,19 @@ def open_sequence(
     light: str | Path | None = None,
     mask: str | Path | None = None,
     map_camera: CameraModel | None = None,
+    bit_depth: int | None = None,
 ) -> FrameSequence:
     """Frames at `path`, of a format found by looking or named; lazy but for a few frames that are checked.
 
     `light` and `mask` are files (light also `gamma=2.2,mu=0`) that win over what is in the folder; a light from here
     was given, even where its file calls it assumed. Camera, in order:
     the file given; the format's own; the map's. For EndoMapper the map's wins, because its maps were not made with the
-    published calibration. `check_sequence` says what is doubtful.
+    published calibration. `bit_depth` is that of pictures of more than 8 bits, found by looking where it is left out.
+    `check_sequence` says what is doubtful.
     """
     path = Path(path)
     try:
-        return check_sequence(_open(path, format, camera, light, mask, map_camera))
+        return check_sequence(_open(path, format, camera, light, mask, map_camera, bit_depth))
     except InputError as error:
         cure = ""
         if path.is_dir() and not _is_cluster(path, format):
@@ -90,6 +92,7 @@ def _open(
     light: str | Path | None,
     mask: str | Path | None,
     map_camera: CameraModel | None,
+    bit_depth: int | None,
 ) -> FrameSequence:
     cluster = _is_cluster(path, format)
     video = video_at(path) if format in (None, "video") else None
@@ -117,7 +120,7 @@ def _open(
         check_image_size(str(first), *image_size(first), chosen)
     if chosen is None and map_camera is not None and not data_set.has_camera(path):
         chosen = _at_size_of_images(map_camera, images)
-    return data_set.read(path, chosen, chosen_light, chosen_mask)
+    return data_set.read(path, chosen, chosen_light, chosen_mask, bit_depth=bit_depth)
 
 
 def _given(light: PhotometricCalibration) -> PhotometricCalibration:
@@ -194,10 +197,7 @@ def _at_size_of_images(camera: CameraModel, folder: Path) -> CameraModel:
 def _size_of_images(folder: Path) -> tuple[int, int] | None:
     """Width and height of the first image, where there is one."""
     image = _first_image(folder)
-    if image is None:
-        return None
-    height, width = read_image(image).shape[:2]
-    return width, height
+    return None if image is None else image_size(image)
 
 
 def _first_image(folder: Path) -> Path | None:

@@ -35,12 +35,12 @@ from lightdepth.camera import Brown, CameraModel, camera_from_params
 from lightdepth.camera_conversion import without_k3
 from lightdepth.datasets.checks import READINGS, fitting_reading
 from lightdepth.datasets.folder import image_folder
-from lightdepth.datasets.format import Format
+from lightdepth.datasets.format import Format, frames_of
 from lightdepth.datasets.scared_files import IMAGES, VIDEO, numbered_members
 from lightdepth.datasets.sequence import FrameSequence, along_ray
-from lightdepth.datasets.video import VideoFile
+from lightdepth.datasets.video import VideoFile, border_of
 from lightdepth.errors import InputError
-from lightdepth.files.images import decode_raw, read_image, read_raw, unit_range
+from lightdepth.files.images import decode_raw, image_size, read_raw, unit_range
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.pose_readings import AS_GIVEN, INVERSE
@@ -73,6 +73,8 @@ def read_scared(
     light: PhotometricCalibration | None = None,
     mask: np.ndarray | None = None,
     view: str = "left",
+    *,
+    bit_depth: int | None = None,
 ) -> FrameSequence:
     """Frames of one view ("left" or "right"), with distance and pose where the folder has them.
 
@@ -86,27 +88,32 @@ def read_scared(
         )
     if (path / VIDEO).is_file():
         return _read_sequence(path, camera, light or PhotometricCalibration(), mask, view)
-    return _read_keyframe(path, camera, light or PhotometricCalibration(), mask, view)
+    return _read_keyframe(path, camera, light or PhotometricCalibration(), mask, view, bit_depth)
 
 
 FORMAT = Format("scared", fits=is_scared, images=image_folder, has_camera=lambda _: True, read=read_scared)
 
 
 def _read_keyframe(
-    path: Path, camera: CameraModel | None, light: PhotometricCalibration, mask: np.ndarray | None, view: str
+    path: Path,
+    camera: CameraModel | None,
+    light: PhotometricCalibration,
+    mask: np.ndarray | None,
+    view: str,
+    bit_depth: int | None,
 ) -> FrameSequence:
     image, truth = path / IMAGES[view], path / f"{view}_depth_map.tiff"
     if not image.is_file():
         raise InputError(path, f"neither {VIDEO} nor {image.name} in it", "is it a keyframe folder of SCARED?")
-    height, width = read_image(image).shape[:2]
+    width, height = image_size(image)
     if camera is None:
         camera = _camera(_read_yaml(path / "endoscope_calibration.yaml", view), width, height, path)
 
-    def load(i: int) -> Frame:
-        distance = _distance(read_raw(truth), camera, truth) if truth.is_file() else None
-        return Frame(f"keyframe_{_number(path)}", read_image(image), camera, light, mask, true_distance=distance)
+    def distance(i: int) -> np.ndarray | None:
+        return _distance(read_raw(truth), camera, truth) if truth.is_file() else None
 
-    return FrameSequence([f"keyframe_{_number(path)}"], load, str(path))
+    names = [f"keyframe_{_number(path)}"]
+    return frames_of(path, [image], camera, light, mask, names=names, distance=distance, bit_depth=bit_depth)
 
 
 def _read_sequence(
@@ -136,6 +143,9 @@ def _read_sequence(
     poses = {n: _pose(*record) for n, record in records.items()}
     view_from_left = np.eye(4) if view == "left" or calibration is None else calibration.right_from_left
     first_row = 0 if view == "left" else height
+    if mask is None:
+        found = border_of(video, slice(first_row, first_row + height))
+        mask = None if found.all() else found
     names = [f"{n:06d}" for n in numbers]
     # An archive is read from its start: its middle and end would cost minutes
     sampled = None if points is None or points.cheap else range(0, min(11, len(numbers)), 5 if len(numbers) > 5 else 1)

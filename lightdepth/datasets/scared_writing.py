@@ -16,7 +16,7 @@ import numpy as np
 from lightdepth.camera import Brown, Pinhole
 from lightdepth.datasets.scared_files import IMAGES, VIDEO
 from lightdepth.errors import InputError
-from lightdepth.files.images import to_bgr8
+from lightdepth.files.images import to_bgr8, write_image
 from lightdepth.frame import Frame
 
 
@@ -59,7 +59,7 @@ def write_scared(frames: Sequence[Frame], path: Path, archives: bool = True, met
             for member, blob in members.items():
                 (data / name / member).write_bytes(blob)
     for image in IMAGES.values():
-        cv2.imwrite(str(path / image), to_bgr8(frames[0].image))
+        write_image(path / image, to_bgr8(frames[0].image))
     if frames[0].true_distance is not None:
         xyz = _points(frames[0])
         (path / "left_depth_map.tiff").write_bytes(_tiff(np.where(xyz[..., 2:] > 0, xyz, np.nan).astype(np.float32)))

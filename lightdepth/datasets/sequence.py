@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,11 +16,13 @@ import numpy as np
 
 from lightdepth.datasets.counting import BY_NUMBER, Counting
 from lightdepth.errors import InputError
-from lightdepth.files.images import image_size, read_image, read_raw
+from lightdepth.files.headers import Header, header_of, what_is_there
+from lightdepth.files.images import ARRAY_SUFFIXES, PICTURE_SUFFIXES, image_size, read_image, read_raw
+from lightdepth.files.masks import read_two_parts
 from lightdepth.frame import Frame, frame_number
 from lightdepth.sparse_map import Keyframe
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, *ARRAY_SUFFIXES)
 
 
 class FrameSequence(Sequence[Frame]):
@@ -90,6 +92,15 @@ class FrameSequence(Sequence[Frame]):
         return replace(frame, camera=keyframe.camera)
 
 
+def readable(sequence: FrameSequence, rows: Iterable[int]) -> list[Frame]:
+    """The frames at these rows, but for those that cannot be read."""
+    frames = []
+    for i in rows:
+        with suppress(InputError):
+            frames.append(sequence[i])
+    return frames
+
+
 @dataclass(frozen=True)
 class _Rows:
     """Loads a slice's frames; unlike a closure it can be pickled, where the loader behind it can."""
@@ -102,8 +113,12 @@ class _Rows:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files with a number in their names, by that number. Masks and thumbnails have none and are left out."""
-    images = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and any(c.isdigit() for c in p.stem)]
+    """Image files with a number in their names, by that number. Masks and thumbnails have none and are left out, and so
+    are hidden files, such as the ._NAME that macOS puts beside each file on other disks."""
+    numbered = [p for p in folder.iterdir() if any(c.isdigit() for c in p.stem) and not p.name.startswith(".")]
+    images: list[Path] = []
+    for kinds in (PICTURE_SUFFIXES, ARRAY_SUFFIXES):
+        images = images or [p for p in numbered if p.suffix.lower() in kinds and not p.is_dir()]
     return sorted(images, key=lambda p: (frame_number(p.name), p.name))
 
 
@@ -154,13 +169,8 @@ def along_ray(depth: np.ndarray, known: np.ndarray, ray_z: np.ndarray) -> np.nda
 def read_mask(path: Path, image: Path | None = None) -> np.ndarray:
     """(H, W) bool, True where tissue shows, of the size of the image where one is given. Files come in both polarities:
     the centre of the image decides."""
-    if not path.is_file():
-        raise InputError(path, "no such mask", "correct its name, or put it there")
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
-        raise InputError(path, "not a readable mask", "expected an image, white where tissue shows")
-    mask = grey > 127
-    height, width = mask.shape
+    bright = read_two_parts(path, "expected an image, white where tissue shows")
+    height, width = bright.shape
     if image is not None and image_size(image) != (width, height):
         wide, high = image_size(image)
         raise InputError(
@@ -168,10 +178,10 @@ def read_mask(path: Path, image: Path | None = None) -> np.ndarray:
             f"the mask is {width}x{height}, but {image.name} is {wide}x{high}",
             "expected a mask of the images' size",
         )
-    centre = mask[int(height * 0.45) : int(height * 0.55) + 1, int(width * 0.45) : int(width * 0.55) + 1]
-    mask = mask if centre.mean() >= 0.5 else ~mask
+    centre = bright[int(height * 0.45) : int(height * 0.55) + 1, int(width * 0.45) : int(width * 0.55) + 1]
+    mask = bright if centre.mean() >= 0.5 else ~bright
     mask.flags.writeable = False  # one for all frames of a sequence
-    if mask.all() and not (grey > 127).any():
+    if not bright.any():
         raise InputError(path, "the mask is black everywhere", "expected white where tissue shows")
     return mask
 
@@ -182,6 +192,41 @@ def legible(images: Sequence[Path]) -> Path | None:
         with suppress(InputError):
             image_size(image)
             return image
+    return None
+
+
+def check_files(images: Sequence[Path]) -> None:
+    """Raises InputError where a frame is no file: a named pipe would be waited for without end."""
+    for image in images:
+        if image.exists() and not image.is_file():
+            raise InputError(image, what_is_there(image), "expected an image file: remove it, or rename it")
+
+
+def warn_of_orientation(source: Path, images: Sequence[Path]) -> None:
+    """Warns of pictures whose files ask to be turned: pixels are taken as they are stored."""
+    step = max(1, len(images) // 32)
+    found = [(image, head) for image in images[::step] if (head := _header(image)) and head.orientation > 1]
+    if found:
+        image, head = found[0]
+        warnings.warn(
+            f"{source}: {image.name} has EXIF orientation {head.orientation} ({len(found)} of {len(images[::step])} "
+            "looked at); it is left aside: pixels are taken as they are stored, and so are camera and mask",
+            stacklevel=6,
+        )
+
+
+def warn_of_border(source: Path, mask: np.ndarray) -> None:
+    """Says that a black border was found, and left out."""
+    warnings.warn(
+        f"{source}: {1 - float(mask.mean()):.0%} of the image is a black border, which is left out; give --mask to "
+        "choose another",
+        stacklevel=6,
+    )
+
+
+def _header(image: Path) -> Header | None:
+    with suppress(InputError, OSError):
+        return header_of(image)
     return None
 
 
@@ -218,9 +263,15 @@ def warn_of_gaps(source: Path, numbers: Sequence[int], known: Container[int]) ->
         )
 
 
-def found_mask(images: Sequence[Path], count: int = 8) -> np.ndarray:
-    """`border_mask` of a sequence's image files, from `count` of them spread over it."""
-    return border_mask([read_image(image) for image in images[:: max(1, len(images) // count)][:count]])
+def found_mask(images: Sequence[Path], white: float | None = None, count: int = 8) -> np.ndarray | None:
+    """`border_mask` of a sequence's image files, from `count` of them spread over it; None where there is no border, or
+    none of them can be read. `white` is as for `read_image`."""
+    read = []
+    for image in images[:: max(1, len(images) // count)][:count]:
+        with suppress(InputError):  # refused by name when it is asked for
+            read.append(read_image(image, white))
+    mask = border_mask(read) if read else np.ones((1, 1), bool)
+    return None if mask.all() else mask
 
 
 def border_mask(images: Sequence[np.ndarray]) -> np.ndarray:

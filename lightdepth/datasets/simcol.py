@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +21,7 @@ from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
 from lightdepth.datasets.sequence import FrameSequence, numbered_files
 from lightdepth.errors import InputError
-from lightdepth.files.images import read_image, to_bgr8
+from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
 
@@ -49,6 +48,8 @@ def read_simcol(
     camera: CameraModel | None = None,
     light: PhotometricCalibration | None = None,
     mask: np.ndarray | None = None,
+    *,
+    bit_depth: int | None = None,
 ) -> FrameSequence:
     """Frames of a SimCol3D trajectory, with distance and pose where the data set has them."""
     colour, depth = numbered_files(path, _COLOUR), numbered_files(path, _DEPTH)
@@ -60,7 +61,7 @@ def read_simcol(
         file = camera_file(path)
         if file is None:
             raise InputError(path, "no cam.txt here or in the folder above", "put it there, or give --camera FILE")
-        height, width = read_image(images[0]).shape[:2]
+        width, height = image_size(images[0])
         # read_camera takes a bare matrix as OpenCV's, with the first centre at (0, 0): undone
         camera = read_camera(file, (width, height)).with_pixel_center(1.0)
     poses = _read_poses(path)
@@ -79,6 +80,7 @@ def read_simcol(
         mask,
         poses=None if poses is None else poses[numbers],
         distance=lambda i: _CODE.distance(depth[numbers[i]], ray_z) if numbers[i] in depth else None,
+        bit_depth=bit_depth,
     )
 
 
@@ -106,11 +108,11 @@ def write_simcol(frames: Sequence[Frame], path: Path) -> None:
     for frame in frames:
         bgr = to_bgr8(frame.image).astype(np.uint16) * 257
         opaque = np.full((*bgr.shape[:2], 1), 65535, np.uint16)
-        cv2.imwrite(str(path / f"FrameBuffer_{frame.number:04d}.png"), np.concatenate([bgr, opaque], -1))
+        write_image(path / f"FrameBuffer_{frame.number:04d}.png", np.concatenate([bgr, opaque], -1))
         if frame.true_distance is not None:
             depth = frame.true_distance * camera.rays()[0][..., 2]
             code = 256 * np.rint(255 * np.clip(depth / FULL_SCALE_MM, 0, 1))
-            cv2.imwrite(str(path / f"Depth_{frame.number:04d}.png"), code.astype(np.uint16))
+            write_image(path / f"Depth_{frame.number:04d}.png", code.astype(np.uint16))
         if frame.true_world_from_cam is not None:
             unity = _FLIP @ frame.true_world_from_cam @ _FLIP
             positions.append(unity[:3, 3] / 10)
@@ -118,7 +120,9 @@ def write_simcol(frames: Sequence[Frame], path: Path) -> None:
     if positions:
         np.savetxt(path.parent / f"{_POSITION}_{_scene(path)}.txt", positions)
         np.savetxt(path.parent / f"{_ROTATION}_{_scene(path)}.txt", quaternions)
-    (path.parent / "cam.txt").write_text(" ".join(repr(float(v)) for v in camera.matrix.ravel()) + "\n")
+    (path.parent / "cam.txt").write_text(
+        " ".join(repr(float(v)) for v in camera.matrix.ravel()) + "\n", encoding="utf-8"
+    )
 
 
 def _scene(path: Path) -> str:
@@ -164,7 +168,7 @@ def _read_poses(path: Path) -> np.ndarray | None:
 
 def _numbers(path: Path, columns: str) -> np.ndarray:
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        rows = np.loadtxt(path, ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(path, f"not lines of numbers ({error})", f"expected `{columns}` on each") from error
     if rows.shape[1] != len(columns.split()):

@@ -27,11 +27,14 @@ class SequenceSource:
     gamma=2.2,mu=0 (response and spread). Left out, the folder's own, else an assumed one."""
     mask: Path | None = None
     """Image, white where tissue shows and black elsewhere, used instead of the folder's own mask. Left out, the
-    folder's own, where it has one, else the whole image."""
+    folder's own, where it has one, else the black border is found."""
+    bit_depth: int | None = None
+    """Bits of a sample in pictures that are stored in more than 8, e.g. 10 where white is 1023; left out, what the
+    files say, else what their highest values show. A larger one reads the same numbers as darker."""
 
     def open(self, map_camera: CameraModel | None = None) -> FrameSequence:
         """The frames; `map_camera` as for open_sequence. Raises InputError where they cannot be read."""
-        return open_sequence(self.data, self.format, self.camera, self.light, self.mask, map_camera)
+        return open_sequence(self.data, self.format, self.camera, self.light, self.mask, map_camera, self.bit_depth)
 
     @property
     def files(self) -> dict[str, Path | None]:

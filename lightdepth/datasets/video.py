@@ -292,7 +292,7 @@ def read_video(
             "map that has one",
         )
     if mask is None:
-        mask = _found_mask(video)
+        mask = border_of(video)
     names = [f"{i:06d}" for i in range(len(video))]
     return FrameSequence(names, _Load(video, camera, light or PhotometricCalibration(), mask), str(path))
 
@@ -303,12 +303,12 @@ def quick_sample(video: VideoFile, count: int) -> list[int]:
     return [there[i] for i in np.unique(np.linspace(0, len(there) - 1, count).round().astype(int))]
 
 
-def _found_mask(video: VideoFile, count: int = 8) -> np.ndarray:
-    """`border_mask` of some frames that decode."""
+def border_of(video: VideoFile, rows: slice = slice(None), count: int = 8) -> np.ndarray:
+    """`border_mask` of these rows of some frames that decode."""
     images = []
     for i in [0, *quick_sample(video, count)]:  # the first decodes, or the file would have been refused
         try:
-            images.append(unit_range(video.read(i)))
+            images.append(unit_range(video.read(i)[rows]))
         except InputError:
             continue  # refused by number when it is asked for
     return border_mask(images)

@@ -17,7 +17,7 @@ _Schema = TypeVar("_Schema", bound=BaseModel)
 def read_json(path: Path) -> Any:
     """Parsed JSON, with the file named in every error."""
     try:
-        return json.loads(Path(path).read_text())
+        return json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(
             path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"

@@ -18,13 +18,13 @@ def write_tum(path: Path, times: Iterable[float], world_from_cam: Iterable[np.nd
     for time, pose in zip(times, world_from_cam, strict=True):
         quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
         lines.append(" ".join([f"{time:.6f}", *(f"{v:.9f}" for v in (*pose[:3, 3], *quaternion))]))
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,) and poses world_from_cam (n, 4, 4) of a TUM trajectory."""
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        rows = np.loadtxt(path, ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(
             path, f"not a TUM trajectory ({error})", "expected lines of 8 numbers: t tx ty tz qx qy qz qw"

@@ -78,7 +78,7 @@ def _remove(path: Path) -> None:
 
 def _write(path: Path, content: Content) -> None:
     if isinstance(content, str):
-        path.write_text(content, encoding="utf-8")
+        path.write_text(content, encoding="utf-8", errors="surrogateescape")  # names of files, whatever they are
     elif isinstance(content, bytes):
         path.write_bytes(content)
     else:

@@ -12,6 +12,7 @@ from lightdepth.calibration import write_camera, write_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.folder import write_times
 from lightdepth.errors import InputError
+from lightdepth.files.images import write_image
 from lightdepth.image_quality import eight_bits, one_field
 from lightdepth.importing.page import Picture
 from lightdepth.importing.regions import Regions
@@ -111,13 +112,13 @@ def write_pictures(
                 label = name if fate[k] == KEPT else f"{name} {fate[k]}"
                 pictures.append((thumbnail(eight_bits(pixels), 160), label, fate[k] == KEPT))
             if fate[k] == KEPT:
-                cv2.imwrite(str(run.folder / "frames" / f"{name}.png"), pixels[..., ::-1])
+                write_image(run.folder / "frames" / f"{name}.png", pixels[..., ::-1])
                 if np.isfinite(time):
                     times[name] = time
                 bar.advance()
     if times:
         write_times(run.folder / "times.csv", times)
-    cv2.imwrite(str(run.folder / "mask.png"), geometry.mask.astype(np.uint8) * 255)
+    write_image(run.folder / "mask.png", geometry.mask.astype(np.uint8) * 255)
     if geometry.camera is not None:
         write_camera(geometry.camera, run.folder / "camera.json")
     if source.light is not None:

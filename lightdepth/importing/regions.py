@@ -11,6 +11,8 @@ import numpy as np
 from lightdepth.datasets.sequence import border_mask, border_region
 from lightdepth.errors import InputError
 from lightdepth.files.images import unit_range
+from lightdepth.files.masks import read_two_parts
+from lightdepth.frame import resized_mask
 from lightdepth.image_quality import eight_bits, one_field
 from lightdepth.importing.overlay import STRETCH, STRETCHES, Overlay, find_overlay
 from lightdepth.importing.source import Source
@@ -55,16 +57,14 @@ def find_regions(source: Source, find_text: bool, given_text: np.ndarray | None,
 
 def read_overlay_mask(path: Path, source: Source) -> np.ndarray:
     """(H, W) bool of a file that is white where text is. Unlike a mask's, its polarity is not guessed."""
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
-        raise InputError(path, "not a readable image", "expected one that is white where text is")
-    if grey.shape != (source.height, source.width):
+    text = read_two_parts(path, "expected an image that is white where text is")
+    if text.shape != (source.height, source.width):
         size = f"{source.width}x{source.height}"
-        raise InputError(path, f"{grey.shape[1]}x{grey.shape[0]}", f"expected {size}, as the images are")
-    return grey > 127
+        raise InputError(path, f"{text.shape[1]}x{text.shape[0]}", f"expected {size}, as the images are")
+    return text
 
 
 def tissue_picture(regions: Regions) -> np.ndarray:
     height, width = regions.tissue.shape
     size = (min(480, width), max(1, round(height * min(480, width) / width)))
-    return cv2.resize(regions.tissue.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return resized_mask(regions.tissue, size)

@@ -58,7 +58,7 @@ def scanned(source: Source, tissue: np.ndarray, choice: Choice, deinterlace: boo
 
 def write_measures(path: Path, source: Source, scan: Scan, fate: np.ndarray) -> None:
     columns = ("brightness", "saturated", "dark", "sharpness", "change", "combing")
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
         writer = csv.writer(file)
         writer.writerow(["number", "seconds", "fate", *columns])
         for k, row in enumerate(scan.rows):

@@ -16,7 +16,7 @@ from lightdepth.datasets.sequence import list_images, read_mask
 from lightdepth.datasets.video import quick_sample, video_at
 from lightdepth.datasets.video_calibration import found_calibration
 from lightdepth.errors import InputError
-from lightdepth.files.images import read_image, to_bgr8
+from lightdepth.files.images import image_size, to_bgr8
 from lightdepth.photometry import PhotometricCalibration
 
 
@@ -121,7 +121,7 @@ def _sequence(source: SequenceSource) -> tuple[FrameSequence, str]:
         images = [] if source.camera is not None or not source.data.is_dir() else _images(source.data)
         if not images:
             raise
-        height, width = read_image(images[0]).shape[:2]
+        width, height = image_size(images[0])
         try:
             stand_in = Pinhole(width, height, width, width, width / 2, height / 2)
             return source.open(stand_in), "none was found"

@@ -222,7 +222,7 @@ def write_text_model(
     for camera_id, camera in enumerate(cameras, 1):
         numbers = " ".join(repr(float(p)) for p in camera.params)
         camera_lines.append(f"{camera_id} {camera.name} {camera.width} {camera.height} {numbers}")
-    (folder / "cameras.txt").write_text("\n".join(camera_lines) + "\n")
+    (folder / "cameras.txt").write_text("\n".join(camera_lines) + "\n", encoding="utf-8", errors="surrogateescape")
 
     row = {int(i): r for r, i in enumerate(submap.point_ids.tolist())}
     errors, looks = _looks(submap, row, images or {})
@@ -241,7 +241,7 @@ def write_text_model(
             if point_id in row:
                 tracks[row[point_id]].append((image_id, index))
         image_lines.append(" ".join(words))
-    (folder / "images.txt").write_text("\n".join(image_lines) + "\n")
+    (folder / "images.txt").write_text("\n".join(image_lines) + "\n", encoding="utf-8", errors="surrogateescape")
 
     point_lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX"]
     for point_id, r in row.items():
@@ -249,7 +249,7 @@ def write_text_model(
         color = " ".join(str(int(c)) for c in colors[r])
         track = " ".join(f"{i} {k}" for i, k in tracks[r])
         point_lines.append(f"{point_id} {xyz} {color} {float(errors[r])!r} {track}".rstrip())
-    (folder / "points3D.txt").write_text("\n".join(point_lines) + "\n")
+    (folder / "points3D.txt").write_text("\n".join(point_lines) + "\n", encoding="utf-8", errors="surrogateescape")
 
 
 def _looks(submap: Submap, row: dict[int, int], images: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

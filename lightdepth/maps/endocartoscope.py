@@ -202,7 +202,7 @@ def _write_map(submap: Submap, folder: Path) -> None:
         params = camera.with_pixel_center(1.0).params  # moves the origin by -0.5: ours to OpenCV's
         numbers = " ".join(_decimals(p, 6) for p in params)
         lines.append(f"{camera_id} {camera.name} {camera.width} {camera.height} {numbers}")
-    (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
+    (folder / "cameras.txt").write_text("\n".join(lines) + "\n", encoding="utf-8", errors="surrogateescape")
 
     lines = [
         "# Image list with two lines of data per image:",
@@ -219,7 +219,7 @@ def _write_map(submap: Submap, folder: Path) -> None:
                 for (u, v), point_id in zip(keyframe.pixels.tolist(), keyframe.point_ids.tolist(), strict=True)
             )
         )
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8", errors="surrogateescape")
 
     lines = [
         "# 3D point list with one line of data per point:",
@@ -227,7 +227,7 @@ def _write_map(submap: Submap, folder: Path) -> None:
     ]
     for point_id, (x, y, z) in zip(submap.point_ids.tolist(), submap.points.tolist(), strict=True):
         lines.append(f"{point_id} {x:.15f} {y:.15f} {z:.15f} 0 0 0 0 ")
-    (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
+    (folder / "points3D.txt").write_text("\n".join(lines) + "\n", encoding="utf-8", errors="surrogateescape")
 
 
 def _write_trajectory(
@@ -241,7 +241,7 @@ def _write_trajectory(
         pose = ",".join(f"{v:.9f}" for v in (*map_from_cam[:3, 3], *quaternion_from_pose(map_from_cam)))
         time = times.get(name, number / fps)
         lines.append(f"{time:.6f},{number:06d}.png,{pose},{int(number in keyframes)},0,-1")
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", errors="surrogateescape")
 
 
 def _decimals(value: float, least: int) -> str:

@@ -294,7 +294,7 @@ def write_stella(submap: Submap, path: Path) -> None:
         },
     }
     if path.suffix.lower() == ".json":
-        path.write_text(json.dumps(content))
+        path.write_text(json.dumps(content), encoding="utf-8")
     else:
         path.write_bytes(msgpack.packb(content))
 

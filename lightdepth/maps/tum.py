@@ -100,7 +100,7 @@ def _texts(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 def first_entry(path: Path) -> str:
     """The first line that is not a comment; empty where there is none or the file is not text."""
     try:
-        with path.open(encoding="utf-8") as lines:
+        with path.open(encoding="utf-8-sig") as lines:
             return next((line for line in lines if not is_comment(line)), "")
     except (OSError, UnicodeDecodeError):
         return ""

@@ -50,7 +50,11 @@ class Report:
 
     def write(self, path: Path) -> None:
         head = f'<meta charset="utf-8"><title>{html.escape(self._title)}</title><style>{_STYLE}</style>'
-        path.write_text(f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(self._parts)}</body></html>\n")
+        path.write_text(
+            f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(self._parts)}</body></html>\n",
+            encoding="utf-8",
+            errors="backslashreplace",  # names that are not UTF-8
+        )
 
 
 def _figure(data: bytes, caption: str) -> str:

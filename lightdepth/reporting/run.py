@@ -55,7 +55,7 @@ class Run:
         self._note(message)
 
     def _note(self, message: str) -> None:
-        with (self.folder / "log.txt").open("a") as file:
+        with (self.folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{time.strftime('%H:%M:%S')} {message}\n")
 
     def fail(self, what: str, reason: str) -> None:
@@ -101,7 +101,7 @@ class Run:
     def finish(self) -> None:
         import yaml
 
-        (self.folder / "config.yaml").write_text(yaml.safe_dump(self._arguments, sort_keys=False))
+        (self.folder / "config.yaml").write_text(yaml.safe_dump(self._arguments, sort_keys=False), encoding="utf-8")
         write_run_json(self.folder, self._verb, self._arguments, self._start, self.record)
 
 
@@ -202,7 +202,8 @@ def input_hash(path: Path) -> str:
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     for file in files:
         size = file.stat().st_size
-        digest.update(f"{file.relative_to(path) if path.is_dir() else file.name}\0{size}\0".encode())
+        name = file.relative_to(path) if path.is_dir() else file.name
+        digest.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape"))
         if size <= 1 << 20:
             digest.update(file.read_bytes())
     return digest.hexdigest()

@@ -16,6 +16,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
+from lightdepth.files.images import write_image
 from lightdepth.frame import Frame, frame_number
 from lightdepth.image_quality import Measures, Meter
 from lightdepth.native import pycolmap
@@ -45,7 +46,6 @@ class Written:
 
 def write_images(frames: Sequence[Frame], images: Path, masks: Path, config: SfmConfig, progress: Progress) -> Written:
     """Frames as PNG files, named by number so that they sort in time, each with its COLMAP mask (a.png: a.png.png)."""
-    import cv2
 
     first: Frame | None = None
     meter: Meter | None = None
@@ -69,8 +69,7 @@ def write_images(frames: Sequence[Frame], images: Path, masks: Path, config: Sfm
             (images, name, evened(image, frame.valid, config.contrast)[..., ::-1]),
             (masks, f"{name}.png", 255 * usable_pixels(frame, config).astype(np.uint8)),
         ):
-            if not cv2.imwrite(str(folder / file), pixels):
-                raise InputError(f"{folder / file}", "cannot be written", "is the disk full?")
+            write_image(folder / file, pixels)
         progress("images", done, len(frames))
     if first is None or meter is None or len(names) < config.min_model_size:
         raise InputError(
@@ -201,7 +200,9 @@ def _match(pc: Any, work: Path, pairs: list[tuple[str, str]], config: SfmConfig,
     pairing.match_list_path = work / "pairs.txt"
     for start in range(0, len(pairs), piece):
         progress("matches", start, len(pairs))
-        (work / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs[start : start + piece]))
+        (work / "pairs.txt").write_text(
+            "".join(f"{a} {b}\n" for a, b in pairs[start : start + piece]), encoding="utf-8"
+        )
         pc.match_image_pairs(
             work / "database.db",
             matching_options=matching,

@@ -41,4 +41,4 @@ def write_synthetic(
         for i, (s, r, t) in export.map_from_world.items()
     }
     (folder / "truth").mkdir(exist_ok=True)
-    (folder / "truth" / "slam.json").write_text(json.dumps(plain(known)) + "\n")
+    (folder / "truth" / "slam.json").write_text(json.dumps(plain(known)) + "\n", encoding="utf-8")

@@ -32,7 +32,7 @@ from .table import Result
 def finished(plan: Plan) -> Result | None:
     """The result in the row's file, where it was made with these settings."""
     try:
-        found = json.loads(plan.path.read_text())
+        found = json.loads(plan.path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):
         return None
     if not isinstance(found, dict) or found.get("stamp") != plan.stamp:

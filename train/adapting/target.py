@@ -128,6 +128,7 @@ def frame_data(
             camera=None if source.camera is None else str(source.camera),
             light=source.light,
             mask=None if source.mask is None else str(source.mask),
+            bit_depth=source.bit_depth,
             held_out=config.held_out,
             tube=source_colons(start.card, config.replay),
             halves=config.replay > 0,

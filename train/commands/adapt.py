@@ -117,7 +117,7 @@ def adapt(
         if outcome.written:
             card = _card(start, module, data, config, outcome)
             save_model(module.network, run.folder / "model.safetensors", card.record())
-            (run.folder / "model.md").write_text(card.text(output.name))
+            (run.folder / "model.md").write_text(card.text(output.name), encoding="utf-8", errors="backslashreplace")
         light = run.record.get("light_fit")
         made = page(target, start, module, outcome, data.counts["val"], light["summary"] if light else None)
         made.wide_figures(pictures.rows())

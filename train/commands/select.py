@@ -53,6 +53,9 @@ class SelectConfig:
     """weights and thresholds of the loftr matcher"""
     loftr_nodes: NodeRules = LOFTR_NODES
     """what is covisible and what is kept, with the loftr matcher"""
+    bit_depth: int | None = None
+    """Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what their
+    highest values show. A larger one reads the same numbers as darker."""
     map_rules: MapRules = field(default_factory=MapRules)
     """what is kept, with --map"""
 
@@ -94,7 +97,7 @@ def select(
         overwrite: Replace the files of an earlier run. Without it, files that are already there are refused.
     """
     paths = _paths(output, no_frames, overwrite)
-    source = SequenceSource(data, format, camera, mask=mask)
+    source = SequenceSource(data, format, camera, mask=mask, bit_depth=config.bit_depth)
     sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, reading)
     settings: dict[str, object]
     if sparse_map is not None and map is not None:

@@ -314,7 +314,7 @@ def published_pairs(folder: Path, sparse_map: SparseMap) -> dict[int, dict[int, 
         if not files:
             continue
         try:
-            lines = [line.split() for line in files[0].read_text().splitlines() if line.strip()]
+            lines = [line.split() for line in files[0].read_text(encoding="utf-8-sig").splitlines() if line.strip()]
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(
                 files[0], f"cannot be read ({error})", "expected lines NAME COVISIBLE COVISIBLE ..."

@@ -16,7 +16,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, resized_mask
 
 _CELLS = 8
 
@@ -210,8 +210,7 @@ class LoftrMatcher:
         height = max(8, round(frame.camera.height * width / frame.camera.width / 8) * 8)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-        mask = cv2.resize(frame.valid.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        mask = _shrunk(mask, 0.01)
+        mask = _shrunk(resized_mask(frame.valid, (width, height)).astype(np.uint8), 0.01)
         image = torch.from_numpy(grey * mask)[None, None].float()
         return _Grey(image, torch.from_numpy(mask.astype(bool)), frame.camera, _cells_in_view(frame))
 
@@ -276,8 +275,7 @@ def _prepared(frame: Frame, settings: SiftSettings) -> tuple[np.ndarray, np.ndar
     scale = min(1.0, settings.width / camera.width)
     size = (max(16, round(camera.width * scale)), max(16, round(camera.height * scale)))
     image = frame.image if scale == 1 else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-    usable: np.ndarray = frame.valid.astype(np.uint8)
-    usable = usable if scale == 1 else cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST)
+    usable = (frame.valid if scale == 1 else resized_mask(frame.valid, size)).astype(np.uint8)
     bright = (image.min(-1) > settings.highlight).astype(np.uint8)
     strip = _strip(settings.border * size[0])
     usable = _shrunk(usable, settings.border) & (1 - cv2.dilate(bright, strip))
