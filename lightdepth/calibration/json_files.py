@@ -42,11 +42,6 @@ class _LightFile(BaseModel):
     source: Literal["measured", "published", "given", "assumed"] = "given"
 
 
-def read_camera_json(path: Path) -> CameraModel:
-    """camera.json -> camera, brought to our pixel convention."""
-    return camera_from_fields(read_json(path), str(path))
-
-
 def camera_from_fields(data: Any, where: str) -> CameraModel:
     """The camera of camera.json's fields, wherever they are written; `where` names the place in errors."""
     found = checked_fields(_CameraFile, data, where)

@@ -137,8 +137,9 @@ def _is_sequence(path: Path) -> bool:
 
 
 def _read_camera(file: Path, folder: Path) -> CameraModel:
-    """The camera of a file; intrinsics.txt, which holds no size, is for the images in the folder."""
-    return read_camera(file, _size_of_images(folder) if file.suffix.lower() == ".txt" else None)
+    """The camera of a file; one that holds no size, as intrinsics.txt, is for the images in the folder."""
+    first = None if file.suffix.lower() == ".xml" else legible(list_images(folder))
+    return read_camera(file, None if first is None else image_size(first))
 
 
 def _open_video(
@@ -148,12 +149,11 @@ def _open_video(
     mask: str | Path | None,
     map_camera: CameraModel | None,
 ) -> FrameSequence:
-    """The frames of a video; intrinsics.txt, which holds no size, is for the video's."""
+    """The frames of a video; a camera's file that holds no size, as intrinsics.txt, is for the video's."""
     chosen = None
     if camera is not None:
         opened = VideoFile(video)
-        size = (opened.width, opened.height) if Path(camera).suffix.lower() == ".txt" else None
-        chosen = read_camera(Path(camera), size)
+        chosen = read_camera(Path(camera), (opened.width, opened.height))
         check_image_size(str(video), opened.width, opened.height, chosen)
     chosen_light = None if light is None else _given(read_light(light))
     chosen_mask = read_mask(Path(mask)) if mask is not None else None

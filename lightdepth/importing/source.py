@@ -97,8 +97,7 @@ def _of_video(video: VideoFile, camera: Path | None, light: str | None, mask: Pa
             why = str(error).replace(str(video.path.parent), "the folder")
     chosen = found.camera if found is not None else None
     if camera is not None:
-        size = (video.width, video.height) if camera.suffix.lower() == ".txt" else None
-        chosen = read_camera(camera, size)
+        chosen = read_camera(camera, (video.width, video.height))
     beside = found.mask if found is not None else None
     return Source(
         numbers=list(range(len(video))),
