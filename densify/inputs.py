@@ -44,11 +44,11 @@ def map_and_frames(
     A map made at another image size is rescaled to theirs. Raises InputError where no frame is of the map, or where
     the images say that they are not its."""
     if mapped.map is None:
-        frames = source.open()
+        frames = source.open().without_truth()
         return made_sparse(run, frames, sfm), frames
     sparse_map = read_map(mapped.map)
     map_camera = sparse_map.submaps[0].keyframes[0].camera
-    frames = source.open(map_camera)
+    frames = source.open(map_camera).without_truth()
     check_shared_frames(sparse_map, frames)
     width, height = frames.image_size()
     given = frames[0].camera if source.camera is not None else None

@@ -53,7 +53,7 @@ def sparse(
         if repair is not None:
             map_and_frames(run, source, MapSource(map=repair, repair_map=True), sfm)
             return
-        frames = source.open()
+        frames = source.open().without_truth()
         made_sparse(run, frames, sfm, None if poses is None else _poses(poses, frames))
 
 

@@ -23,8 +23,8 @@ def write_tum(path: Path, times: Iterable[float], world_from_cam: Iterable[np.nd
 
 
 def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) and poses world_from_cam (n, 4, 4) of a TUM trajectory, or of KITTI's poses, whose times are the frames'
-    numbers."""
+    """Times (n,) and poses world_from_cam (n, 4, 4) of a TUM trajectory, or of KITTI's poses, whose times are the
+    numbers of the frames."""
     try:
         rows = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError) as error:

@@ -115,7 +115,7 @@ def _of_video(video: VideoFile, camera: Path | None, light: str | None, mask: Pa
 def _sequence(source: SequenceSource) -> tuple[FrameSequence, str]:
     """Frames of a folder; where only the camera is missing, with one that stands in, and what was said of it."""
     try:
-        return source.open(), ""
+        return source.open().without_truth(), ""
     except InputError as error:
         images = [] if source.camera is not None or not source.data.is_dir() else _images(source.data)
         if not images:
@@ -123,7 +123,7 @@ def _sequence(source: SequenceSource) -> tuple[FrameSequence, str]:
         height, width = read_image(images[0]).shape[:2]
         try:
             stand_in = Pinhole(width, height, width, width, width / 2, height / 2)
-            return source.open(stand_in), "none was found"
+            return source.open(stand_in).without_truth(), "none was found"
         except InputError:
             raise error from None
 

@@ -94,7 +94,7 @@ def select(
     paths = _paths(output, no_frames, overwrite)
     sparse_map = read_map(map) if map is not None else None
     map_camera = sparse_map.submaps[0].keyframes[0].camera if sparse_map is not None else None
-    frames = SequenceSource(data, format, camera, mask=mask).open(map_camera)
+    frames = SequenceSource(data, format, camera, mask=mask).open(map_camera).without_truth()
     settings: dict[str, object]
     if sparse_map is not None and map is not None:
         verdicts, how = _by_map(frames, sparse_map, map, config.map_rules)
