@@ -23,6 +23,7 @@ from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.made import made_sparse
 from lightdepth.sfm.repair import repaired_submap
 from lightdepth.sparse_map import Keyframe, SparseMap
+from lightdepth.uncalibrated import open_frames
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,11 @@ def map_and_frames(
     A map made at another image size is rescaled to theirs. Raises InputError where no frame is of the map, or where
     the images say that they are not its."""
     if mapped.map is None:
-        frames = source.open().without_truth()
+        frames = open_frames(source, run, None, sfm).without_truth()
         return made_sparse(run, frames, sfm), frames
     sparse_map = read_map(mapped.map)
     map_camera = sparse_map.submaps[0].keyframes[0].camera
-    frames = source.open(map_camera).without_truth()
+    frames = open_frames(source, run, map_camera).without_truth()
     check_shared_frames(sparse_map, frames)
     width, height = frames.image_size()
     given = frames[0].camera if source.camera is not None else None

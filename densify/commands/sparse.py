@@ -13,6 +13,7 @@ from lightdepth.files.tum import read_tum
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.made import made_sparse
+from lightdepth.uncalibrated import open_frames
 
 
 def sparse(
@@ -20,6 +21,7 @@ def sparse(
     output: Path,
     format: FormatName | None = None,
     camera: Path | None = None,
+    fov: float | None = None,
     mask: Path | None = None,
     poses: str | None = None,
     repair: Path | None = None,
@@ -33,7 +35,9 @@ def sparse(
         output: Folder to make, with one COLMAP model for each submap.
         format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
             looking if left out.
-        camera: Calibration file that wins over the folder's own.
+        camera: Calibration file that wins over the folder's own; `auto` finds the camera from the frames' motion.
+        fov: Field of view across the image's width, degrees, where --camera auto starts, and what is assumed where the
+            motion tells nothing. A larger one means a shorter focal length.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         poses: Known poses of the frames: truth (those of the sequence), or a TUM file (world from camera) whose times
             are frame numbers; only points are then found. Left out, poses are found as well.
@@ -44,16 +48,16 @@ def sparse(
     """
     if repair is not None and poses is not None:
         raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
-    source = SequenceSource(data, format, camera, mask=mask)
+    source = SequenceSource(data, format, camera, mask=mask, fov=fov)
     arguments = recorded(
-        output=output, data=data, format=format, camera=camera, mask=mask, poses=poses, repair=repair, sfm=sfm
+        output=output, data=data, format=format, camera=camera, fov=fov, mask=mask, poses=poses, repair=repair, sfm=sfm
     )
     with run_folder(output, "sparse", arguments, overwrite) as run:
         run.hash_inputs(data=data, repair=repair)
         if repair is not None:
             map_and_frames(run, source, MapSource(map=repair, repair_map=True), sfm)
             return
-        frames = source.open().without_truth()
+        frames = open_frames(source, run, None, sfm).without_truth()
         made_sparse(run, frames, sfm, None if poses is None else _poses(poses, frames))
 
 

@@ -16,6 +16,7 @@ from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
+from lightdepth.uncalibrated import open_frames
 
 
 def predict(
@@ -53,7 +54,7 @@ def predict(
     if refine:
         model = RefinedModel(model, RefineConfig(steps=refine))
     with run_folder(output, "predict", arguments, overwrite) as run:
-        frames = source.open().without_truth()
+        frames = open_frames(source, run).without_truth()
         run.hash_inputs(data=source.data)
         if previews:
             (run.folder / "previews").mkdir()

@@ -11,7 +11,7 @@ from lightdepth.camera import CameraModel
 from lightdepth.datasets import c3vd, endomapper, endoslam, folder, hamlyn, scared, simcol
 from lightdepth.datasets.checks import check_sequence
 from lightdepth.datasets.format import Format
-from lightdepth.datasets.sequence import FrameSequence, legible, list_images, read_mask
+from lightdepth.datasets.sequence import FrameSequence, legible, list_images, no_images, read_mask
 from lightdepth.datasets.video import VideoFile, read_video, video_at
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, read_image
@@ -173,6 +173,22 @@ def _size_of_images(folder: Path) -> tuple[int, int] | None:
         return None
     height, width = read_image(image).shape[:2]
     return width, height
+
+
+def size_of_frames(path: Path, format: str | None = None) -> tuple[int, int]:
+    """Width and height of the frames at `path`, a video or a folder, as far as they need no camera."""
+    video = video_at(path) if format in (None, "video") and path.exists() else None
+    if video is not None:
+        opened = VideoFile(video)
+        return opened.width, opened.height
+    if not path.is_dir():
+        found = "is a file" if path.is_file() else "does not exist"
+        raise InputError(path, found, "expected a folder of frames, or a video such as .mp4 or .mov")
+    data_set = _BY_NAME.get(format or "") or _looks_like(path) or folder.FORMAT
+    first = legible(list_images(data_set.images(path)))
+    if first is None:
+        raise InputError(path, f"{no_images(data_set.images(path))}", "expected frames such as 000123.png")
+    return image_size(first)
 
 
 def _first_image(folder: Path) -> Path | None:
