@@ -31,13 +31,14 @@ from lightdepth.sfm.features import features_and_matches, quiet, write_images
 from lightdepth.sfm.reconstruction import mapping_options, silent
 
 TOLERATED = 0.03
-"""Deviation, as a share of the focal length, above which the motion is said not to tell it."""
+"""Error of the focal length, as a share of it: where two deviations exceed it, the motion is said not to tell it."""
 _PINHOLE, _FISHEYE = "SIMPLE_PINHOLE", "OPENCV_FISHEYE"
 _FIELDS = {_PINHOLE: (55.0, 80.0, 110.0), _FISHEYE: (90.0, 140.0)}  # across the width, degrees
 _CLEARLY = 0.95  # of the pinhole's reprojection error, below which the fisheye is taken
 _AS_GOOD, _ALIKE = 1.05, 1.25  # times the best one's reprojection error: not worse; in the same valley
 _MAPPED = 0.7  # of the most frames that any start maps, with which a map takes part
 _GROUPS = 5  # of points, for the jackknife
+_INFLATION = 2.5  # of the jackknife: errors of points that share frames come together (four clips of synthetic colons)
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class SelfCalibration:
     @property
     def told(self) -> bool:
         """Whether the motion tells the focal length within what is tolerated."""
-        return self.deviation <= TOLERATED
+        return 2 * self.deviation <= TOLERATED
 
     def __str__(self) -> str:
         f, width = self.camera.focal_length, self.camera.width
@@ -125,7 +126,7 @@ def self_calibrated(
         alike = [e for e in endings if e.model == best.model and e.error <= _ALIKE * best.error]
         ends = [_focal(e.params, e.model) for e in alike if e.images >= _MAPPED * best.images]
         spread = float(np.ptp([focal, *ends])) / 2 / focal
-        deviation = max(spread, _jackknife(best, config))
+        deviation = max(spread, _INFLATION * _jackknife(best, config))
         progress("calibration", len(starts) + 1, len(starts) + 1)
     camera = camera_from_params(best.model, width, height, best.params)
     return SelfCalibration(
