@@ -202,7 +202,7 @@ def test_a_focal_length_below_3_pixels_is_refused_with_what_it_would_be(tmp_path
 # ---- the kind, not the case
 
 
-@pytest.mark.parametrize("case", range(24))
+@pytest.mark.parametrize("case", [*range(24), *(pytest.param(case, marks=pytest.mark.slow) for case in range(24, 200))])
 def test_a_lens_drawn_at_random_is_read_in_every_format_that_holds_it(tmp_path, case):
     seed = 7000 + case
     print(f"seed {seed}")

@@ -36,8 +36,8 @@ def sparse(
         format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
             looking if left out.
         camera: Calibration file that wins over the folder's own; `auto` finds the camera from the frames' motion.
-        fov: Field of view across the image's width, degrees, where --camera auto starts, and what is assumed where the
-            motion tells nothing. A larger one means a shorter focal length.
+        fov: Field of view across the image's width, degrees, at which --camera auto (which it implies) starts, and
+            which is assumed where the frames do not connect. A larger one means a shorter focal length.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         poses: Known poses of the frames: truth (those of the sequence), or a TUM file (world from camera) whose times
             are frame numbers; only points are then found. Left out, poses are found as well.

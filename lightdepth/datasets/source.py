@@ -22,7 +22,8 @@ class SequenceSource:
     endoslam or endomapper. Left out, it is told by the files."""
     camera: Path | None = None
     """Calibration file of the camera, used instead of the folder's own. Left out, the folder's own, else that of the
-    map, where one is given. `auto` finds the camera from the frames' motion (import, predict, densify, live, sparse)."""
+    map, where one is given. `auto` finds the camera from the frames' motion, in import, predict, densify, live and
+    sparse."""
     light: str | None = None
     """Light of the endoscope, used instead of the folder's own: a light.json, a photometric XML, or values such as
     gamma=2.2,mu=0 (response and spread). Left out, the folder's own, else an assumed one."""
