@@ -135,3 +135,18 @@ def test_a_video_without_calibration_becomes_a_surface_in_one_command(tmp_path):
     assert main(command) in (0, 4)
     assert (out / "map_000" / "mesh.ply").is_file()
     assert json.loads((out / "camera.json").read_text())["source"] == "self-calibrated"
+
+
+@pytest.mark.slow
+def test_an_import_without_calibration_writes_one_that_says_how_it_was_found_also_when_cut(tmp_path):
+    true = across(240, 200, 95)
+    frames = box_film(true, 8)
+    for frame in frames:  # a black border
+        frame.image[:, :20] = frame.image[:, -20:] = 0
+    data, out = written(tmp_path / "data", frames), tmp_path / "imported"
+    command = ["import", str(data), "-o", str(out), "--fov", "80", "--crop", "auto", "--no-find-text"]
+    assert main(command) == 0
+    told = json.loads((out / "camera.json").read_text())
+    assert told["source"] == "self-calibrated" and told["width"] < 240
+    assert read_camera(out / "camera.json").focal_length == pytest.approx(true.focal_length, rel=0.02)
+    assert main(["predict", str(out), "-o", str(tmp_path / "depth"), "--checkpoint", "decline"]) == 0
