@@ -39,8 +39,8 @@ _BROWN = (
 )
 _OTHER_LENSES = ("omni", "omnidir", "mei", "unified", "ucm", "eucm", "ds", "doublesphere", "scaramuzza", "ocam", "fov")
 # Keys in small letters, `_` and `-` left out; the first one that a file has counts.
-_WIDTHS = ("imagewidth", "width", "imgwidth", "w", "cols", "nx")
-_HEIGHTS = ("imageheight", "height", "imgheight", "h", "rows", "ny")
+_WIDTHS = ("imagewidth", "width", "imgwidth", "w", "cols")
+_HEIGHTS = ("imageheight", "height", "imgheight", "h", "rows")
 _SIZES = ("imagesize", "imgsize", "resolution", "size", "dims", "dim")
 _SHAPES = ("imageshape", "imgshape", "shape")  # rows before columns, as numpy has it
 _MATRICES = ("cameramatrix", "k", "mtx", "intrinsicmatrix", "intrinsics", "intrinsic", "cameraintrinsics", "m")
@@ -88,7 +88,7 @@ def matrix_and_distortion(content: Fields, path: Path, size: tuple[int, int] | N
         camera = camera_from_params(KannalaBrandt.name, width, height, [*focal, *terms], str(path))
     else:
         camera = camera_of(lambda: opencv_camera(width, height, [*focal, *_opencv_terms(terms, where)]), str(path))
-        if len(terms) == 4 and any(terms) and not any(letters(fields.get(key)) for key in _MODELS):
+        if len(terms) == 4 and any(terms) and not any(letters(fields.get(key)) in _BROWN[:-1] for key in _MODELS):
             warnings.warn(
                 f"{where}: 4 numbers and no distortion_model: read as k1 k2 p1 p2. If cv2.fisheye made them, add the "
                 "line `distortion_model: fisheye`",
@@ -118,6 +118,11 @@ def _missing(key: str, path: Path) -> InputError:
 
 def _first(fields: Fields, keys: Sequence[str]) -> str | None:
     return next((key for key in keys if fields.get(key) is not None), None)
+
+
+def _first_of_many(fields: Fields, keys: Sequence[str]) -> str | None:
+    """The first of the keys whose value is several: a square's `size` is none of an image, nor `distortion: none`."""
+    return next((key for key in keys if isinstance(fields.get(key), list | dict)), None)
 
 
 def _flat(value: Any, where: str) -> list[float]:
@@ -177,9 +182,9 @@ def _size_of(fields: Fields, path: Path, size: tuple[int, int] | None) -> tuple[
     wide, high = _first(fields, _WIDTHS), _first(fields, _HEIGHTS)
     if wide is not None and high is not None:
         found = [fields[wide], fields[high]]
-    elif (key := _first(fields, _SIZES)) is not None:
+    elif (key := _first_of_many(fields, _SIZES)) is not None:
         found = _pair(fields[key], f"{path}: {key}")
-    elif (key := _first(fields, _SHAPES)) is not None:
+    elif (key := _first_of_many(fields, _SHAPES)) is not None:
         found = _pair(fields[key], f"{path}: {key}")[::-1]
     else:
         missing = "image_width" if wide is None else "image_height"
@@ -229,7 +234,7 @@ def _is_fisheye(fields: Fields, path: Path) -> bool:
 
 def _coefficients(fields: Fields, path: Path) -> list[float]:
     """D as a matrix, or in one key each."""
-    key = _first(fields, _COEFFICIENTS)
+    key = _first_of_many(fields, _COEFFICIENTS)
     if key is not None:
         value = fields[key]
         if isinstance(value, dict) and "data" not in value and any(str(k).lower() == "k1" for k in value):
