@@ -37,6 +37,8 @@ _FIELDS = {_PINHOLE: (55.0, 80.0, 110.0), _FISHEYE: (90.0, 140.0)}  # across the
 _CLEARLY = 0.95  # of the pinhole's reprojection error, below which the fisheye is taken
 _AS_GOOD, _ALIKE = 1.05, 1.25  # times the best one's reprojection error: not worse; in the same valley
 _MAPPED = 0.7  # of the most frames that any start maps, with which a map takes part
+_ACROSS = 35.0, 170.0  # degrees across the width, that endoscopes see
+_MODELS = 5  # that a start may try
 _GROUPS = 5  # of points, for the jackknife
 _INFLATION = 2.5  # of the jackknife: errors of points that share frames come together (four clips of synthetic colons)
 
@@ -123,10 +125,11 @@ def self_calibrated(
         if again is not None and again.images >= best.images and again.error <= _AS_GOOD * best.error:
             best = again
         focal = _focal(best.params, best.model)
-        alike = [e for e in endings if e.model == best.model and e.error <= _ALIKE * best.error]
-        ends = [_focal(e.params, e.model) for e in alike if e.images >= _MAPPED * best.images]
-        spread = float(np.ptp([focal, *ends])) / 2 / focal
-        deviation = max(spread, _INFLATION * _jackknife(best, config))
+        alike = [e for e in endings if e.model == best.model and e.images >= _MAPPED * best.images]
+        ends = [_focal(e.params, e.model) for e in alike if e.error <= _ALIKE * best.error]
+        as_good = [_focal(e.params, e.model) for e in alike if e.error <= _AS_GOOD * best.error]
+        spread = float(np.ptp([focal, *as_good])) / 2 / focal
+        deviation = min(1.0, max(spread, _INFLATION * _jackknife(best, config)))
         progress("calibration", len(starts) + 1, len(starts) + 1)
     camera = camera_from_params(best.model, width, height, best.params)
     return SelfCalibration(
@@ -181,7 +184,7 @@ def _ended(work: Path, model: str, params: list[float], size: tuple[int, int], c
             new.has_prior_focal_length = True
             opened.update_camera(new)
         options = mapping_options(pc, config)
-        options.multiple_models = False
+        options.max_num_models = _MODELS  # a first pair may lead nowhere: the largest map counts
         models = pc.incremental_mapping(work / "database.db", work / "images", Path(out), options)
         if not models:
             return None
@@ -201,10 +204,25 @@ def _refined(pc: Any, found: Any, model: str, size: tuple[int, int], config: Sfm
     (camera,) = found.cameras.values()
     params = [float(p) for p in camera.params]
     error = float(found.compute_mean_reprojection_error())
-    field = 2 * np.degrees(np.arctan(size[0] / 2 / max(params[0], 1e-9)))
-    if not np.isfinite([*params, error]).all() or not 5 < field < 175 or error > 4:
+    if (
+        not np.isfinite([*params, error]).all()
+        or min(params[:2]) <= 0
+        or error > 4
+        or not _plausible(model, params, size)
+    ):
         return None
     return _Ending(model, params, error, found.num_reg_images(), found.num_points3D(), found)
+
+
+def _plausible(model: str, params: list[float], size: tuple[int, int]) -> bool:
+    """Whether a lens sees its whole image, as far as the middle of each side, and across the width as endoscopes do."""
+    camera = camera_from_params(model, *size, params)
+    width, height = size
+    sides = np.array([[0, height / 2], [width, height / 2], [width / 2, 0], [width / 2, height]])
+    rays, seen = camera.unproject(sides)
+    across_width = float(np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1, 1))))
+    even = model == _PINHOLE or abs(params[0] / params[1] - 1) < 0.1
+    return bool(seen.all()) and even and _ACROSS[0] <= across_width <= _ACROSS[1]
 
 
 def _jackknife(ending: _Ending, config: SfmConfig) -> float:
