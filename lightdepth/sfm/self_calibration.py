@@ -8,8 +8,8 @@ error wins, is made anew with the lens found, and refined again. The principal p
 and a pinhole is preferred unless the fisheye is clearly closer: distortion that the data do not hold costs focal
 length.
 
-The deviation is a jackknife over groups of points, each left out in turn, or the spread over the starts that end as
-well as the best, whichever is larger. Motion straight ahead tells little of a focal length: then it is large, and said.
+The deviation is a jackknife over groups of points, each left out in turn. Motion straight ahead tells little of a focal
+length: then it is large, and said.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TOLERATED = 0.03
 _PINHOLE, _FISHEYE = "SIMPLE_PINHOLE", "OPENCV_FISHEYE"
 _FIELDS = {_PINHOLE: (55.0, 80.0, 110.0), _FISHEYE: (90.0, 140.0)}  # across the width, degrees
 _CLEARLY = 0.95  # of the pinhole's reprojection error, below which the fisheye is taken
-_AS_GOOD, _ALIKE = 1.05, 1.25  # times the best one's reprojection error: not worse; in the same valley
+_ALIKE = 1.25  # times the best one's reprojection error, up to which an ending is in the same valley
 _MAPPED = 0.7  # of the most frames that any start maps, with which a map takes part
 _ACROSS = 35.0, 170.0  # degrees across the width, that endoscopes see
 _MODELS = 5  # that a start may try
@@ -122,14 +122,11 @@ def self_calibrated(
                 endings.append(ending)
         best = _best(endings, len(written.names), config)
         again = _ended(work, best.model, best.params, (width, height), config)
-        if again is not None and again.images >= best.images and again.error <= _AS_GOOD * best.error:
+        if again is not None and again.images >= best.images and again.error <= _ALIKE * best.error:
             best = again
-        focal = _focal(best.params, best.model)
         alike = [e for e in endings if e.model == best.model and e.images >= _MAPPED * best.images]
         ends = [_focal(e.params, e.model) for e in alike if e.error <= _ALIKE * best.error]
-        as_good = [_focal(e.params, e.model) for e in alike if e.error <= _AS_GOOD * best.error]
-        spread = float(np.ptp([focal, *as_good])) / 2 / focal
-        deviation = min(1.0, max(spread, _INFLATION * _jackknife(best, config)))
+        deviation = min(1.0, _INFLATION * _jackknife(best, config))
         progress("calibration", len(starts) + 1, len(starts) + 1)
     camera = camera_from_params(best.model, width, height, best.params)
     return SelfCalibration(
@@ -201,6 +198,7 @@ def _refined(pc: Any, found: Any, model: str, size: tuple[int, int], config: Sfm
         setup.add_image(image_id)
     setup.fix_gauge(pc.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pc.create_default_bundle_adjuster(options, setup, found).solve()
+    found.update_point_3d_errors()
     (camera,) = found.cameras.values()
     params = [float(p) for p in camera.params]
     error = float(found.compute_mean_reprojection_error())
