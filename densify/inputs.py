@@ -25,6 +25,7 @@ from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.made import made_sparse
 from lightdepth.sfm.repair import repaired_submap
 from lightdepth.sparse_map import Keyframe, SparseMap
+from lightdepth.uncalibrated import check_camera_asked, open_frames
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,11 @@ def map_and_frames(
     A map made at another image size is rescaled to theirs. Raises InputError where no frame is of the map, or where
     the images say that they are not its."""
     if mapped.map is None:
-        frames = source.open()
+        frames = open_frames(source, run, None, sfm).without_truth()
         return made_sparse(run, frames, sfm), frames
+    check_camera_asked(source)
     sparse_map, frames = open_with_map(source, mapped.map, mapped)
+    frames = frames.without_truth()
     sparse_map = by_the_images(sparse_map, frames)
     map_camera = sparse_map.submaps[0].keyframes[0].camera
     check_shared_frames(sparse_map, frames)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from lightdepth.camera import CAMERA_MODELS, Brown, CameraModel, KannalaBrandt, Pinhole, Scaramuzza
+from lightdepth.camera import CAMERA_MODELS, Brown, CameraModel, FullBrown, KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.errors import InputError
 
 _FITTED = 5000  # pixels, of all that count
@@ -56,7 +56,7 @@ def convert_camera(
     if not len(rows):
         raise InputError("the mask", "no valid pixel in it: no camera can be fitted", "is it inverted?")
     rays, pixels = all_rays[rows, columns], np.stack([columns, rows], -1) + 0.5
-    fitted = np.flatnonzero(rays[:, 2] > _PLANE_LIMIT) if model in (Pinhole, Brown) else np.arange(len(rays))
+    fitted = np.flatnonzero(rays[:, 2] > _PLANE_LIMIT) if issubclass(model, Pinhole | Brown) else np.arange(len(rays))
     if not len(fitted):
         raise InputError(
             "the mask",
@@ -143,6 +143,7 @@ def _ray_residuals(trial: CameraModel, rays: np.ndarray, pixels: np.ndarray) -> 
 _RESIDUALS: dict[type[CameraModel], _Residuals] = {
     Pinhole: _pixel_residuals,
     Brown: _pixel_residuals,
+    FullBrown: _pixel_residuals,
     KannalaBrandt: _pixel_residuals,
     Scaramuzza: _ray_residuals,
 }

@@ -56,7 +56,7 @@ BAD_CAMERAS = {
     "width missing": {k: v for k, v in PINHOLE_FILE.items() if k != "width"},
     "pixel_center": {**PINHOLE_FILE, "pixel_center": 0.25},
     "params.1": {**PINHOLE_FILE, "params": [500, "wide", 320, 240]},
-    "unknown camera model 'FISHEYE'": {**PINHOLE_FILE, "model": "FISHEYE"},
+    "unknown camera model 'MEI'": {**PINHOLE_FILE, "model": "MEI"},
     "3 parameters of PINHOLE": {**PINHOLE_FILE, "params": [500, 320, 240]},
     "PINHOLE camera … focal lengths": {**PINHOLE_FILE, "params": [-500, 500, 320, 240]},
     "cx not finite": '{"model": "PINHOLE", "width": 640, "height": 480, "params": [500, 500, NaN, 240]}',

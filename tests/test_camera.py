@@ -16,6 +16,7 @@ from lightdepth.camera import (
     CAMERA_MODELS,
     Brown,
     CameraModel,
+    FullBrown,
     KannalaBrandt,
     Pinhole,
     Scaramuzza,
@@ -25,7 +26,9 @@ from lightdepth.datasets.c3vd import C3VD_V2
 
 # Strong enough for tangential terms to fold the image before radial ones would
 STRONG = Brown(640, 480, 400.0, 408.0, 328.0, 236.8, -0.5, 0.12, 0.02, -0.015)
-ALL = {**LENSES, "c3vd v2": C3VD_V2, "strong brown": STRONG}
+K3 = FullBrown(640, 480, 520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172, 0.0, 0.0, 0.0)
+RATIONAL = FullBrown(640, 480, 400.0, 410.0, 322.0, 238.0, 0.3, 0.1, 0.001, 5e-4, 0.02, 0.5, 0.2, 0.01)
+ALL = {**LENSES, "c3vd v2": C3VD_V2, "strong brown": STRONG, "k3": K3, "rational": RATIONAL}
 VARIANTS = {
     "as published": lambda camera: camera,
     "resized": lambda camera: camera.resized(camera.width // 5, camera.height // 5),
@@ -370,7 +373,7 @@ BAD = {
     "focal lengths -5": lambda: KannalaBrandt(640, 480, -5.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     "a0 = -769": lambda: Scaramuzza(640, 480, 0.0, 0.0, -769.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
     "singular": lambda: Scaramuzza(640, 480, 0.0, 0.0, 769.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    "my.json … unknown camera model 'FOV'": lambda: camera_from_params("FOV", 640, 480, [1.0], "my.json"),
+    "my.json … unknown camera model 'MEI'": lambda: camera_from_params("MEI", 640, 480, [1.0], "my.json"),
     "my.json … 3 parameters of PINHOLE": lambda: camera_from_params("PINHOLE", 9, 9, [1.0] * 3, "my.json"),
     "my.json: PINHOLE camera … focal": lambda: camera_from_params("PINHOLE", 9, 9, [-1.0] * 4, "my.json"),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,9 @@ import pytest
 from colons import CAMERA, colon
 from raising import refused
 
+from lightdepth.calibration import write_camera
+from lightdepth.camera import CameraModel
+from lightdepth.cli import main
 from lightdepth.datasets import (
     open_sequence,
     read_c3vd,
@@ -20,8 +24,9 @@ from lightdepth.datasets import (
     write_hamlyn,
     write_simcol,
 )
-from lightdepth.datasets.c3vd import C3VD, C3VD_V2
-from lightdepth.tube import lens
+from lightdepth.datasets.c3vd import C3VD, C3VD_UNDISTORTED, C3VD_V2
+from lightdepth.frame import Frame
+from lightdepth.tube import lens, render_sequence
 
 C3VD_LENSES = {"v1 sorted": C3VD.resized(100, 80), "v2": C3VD_V2.resized(100, 80)}
 
@@ -113,6 +118,52 @@ def test_a_second_edition_with_something_wrong_is_refused_with_what_and_where(ho
     spoil_v2(tmp_path / "seq", how)
     with refused(SPOILED_V2[how]):
         list(read_c3vd(tmp_path / "seq"))
+
+
+def undistorted_tree(root: Path, tree: str) -> tuple[list[Frame], CameraModel]:
+    """A tree of frames as EndoGSLAM's scripts leave it: a pinhole that fills its image, and depth of 8 bits."""
+    camera = C3VD_UNDISTORTED.resized(100, 80)
+    frames = [replace(f, mask=None) for f in render_sequence(3, 3, camera, 6.0, mask=np.ones((80, 100), bool)).frames]
+    write_c3vd(frames, root, tree)
+    for file in root.rglob("*_depth.tiff"):
+        code = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(file), (code / 65535 * 255).astype(np.uint8))
+    return frames, camera
+
+
+@pytest.mark.filterwarnings("ignore:.*cannot be read")
+def test_endogslam_s_undistorted_tree_is_told_by_its_corners_and_gets_its_pinhole(tmp_path):
+    given, camera = undistorted_tree(tmp_path / "seq", "v1 sorted")
+    with pytest.warns(UserWarning, match="images look undistorted or cropped; sorted into .* fx 802.319"):
+        read = open_sequence(tmp_path / "seq")
+    assert read.without_truth()[0].camera == camera
+    assert np.abs(read.without_truth()[0].image - given[0].image).max() < 1e-6
+    own = tmp_path / "camera.json"
+    write_camera(given[0].camera.resized(100, 80), own)
+    assert open_sequence(tmp_path / "seq", camera=own).without_truth()[1].camera == camera
+
+
+@pytest.mark.parametrize("tree", ["v1", "v2"])
+def test_other_undistorted_trees_of_c3vd_are_refused_with_that_word(tmp_path, tree, capsys):
+    undistorted_tree(tmp_path / "seq", tree)
+    assert main(["predict", str(tmp_path / "seq"), "-o", str(tmp_path / "out"), "--checkpoint", "decline"]) == 3
+    assert "undistorted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("how", ["eight bits", "eight bits in sixteen"])
+def test_depth_of_eight_bits_stops_no_prediction_and_judges_none(tmp_path, how, capsys):
+    write_c3vd(colon(0, 3, 6.0, C3VD_LENSES["v1 sorted"]).frames, tmp_path / "seq", "v1 sorted")
+    for file in (tmp_path / "seq").rglob("*_depth.tiff"):
+        code = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) / 65535 * 255
+        cv2.imwrite(str(file), code.astype(np.uint8 if how == "eight bits" else np.uint16))
+    out = tmp_path / "out"
+    assert main(["predict", str(tmp_path / "seq"), "-o", str(out), "--checkpoint", "decline"]) == 0
+    assert len(list(out.glob("*.npz"))) == 3
+    assert any("cannot be read" in said for said in json.loads((out / "run.json").read_text())["warnings"])
+    capsys.readouterr()
+    assert main(["evaluate", str(out), "--truth", str(tmp_path / "seq")]) == 3
+    said = " ".join(capsys.readouterr().err.split())
+    assert "depth" in said and ("16 bits" in said or "8 bits kept in 16" in said)
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from lightdepth.maps.convention import MapConvention, MapReading
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.made import made_sparse
+from lightdepth.uncalibrated import open_frames
 
 
 def sparse(
@@ -24,6 +25,7 @@ def sparse(
     output: Path,
     format: FormatName | None = None,
     camera: Path | None = None,
+    fov: float | None = None,
     mask: Path | None = None,
     bit_depth: int | None = None,
     poses: str | None = None,
@@ -39,7 +41,9 @@ def sparse(
         output: Folder to make, with one COLMAP model for each submap.
         format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
             looking if left out.
-        camera: Calibration file that wins over the folder's own.
+        camera: Calibration file that wins over the folder's own; `auto` finds the camera from the frames' motion.
+        fov: Field of view across the image's width, degrees, at which --camera auto (which it implies) starts, and
+            which is assumed where the frames do not connect. A larger one means a shorter focal length.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
             their highest values show. A larger one reads the same numbers as darker.
@@ -53,13 +57,14 @@ def sparse(
     """
     if repair is not None and poses is not None:
         raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
-    source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth)
+    source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth, fov=fov)
     arguments = recorded(
         reading,
         output=output,
         data=data,
         format=format,
         camera=camera,
+        fov=fov,
         mask=mask,
         bit_depth=bit_depth,
         poses=poses,
@@ -71,7 +76,7 @@ def sparse(
         if repair is not None:
             map_and_frames(run, source, MapSource.read_as(repair, reading, repair_map=True), sfm)
             return
-        frames = source.open()
+        frames = open_frames(source, run, None, sfm).without_truth()
         made_sparse(run, frames, sfm, None if poses is None else _poses(poses, frames, source, reading))
 
 

@@ -29,6 +29,10 @@ class _CameraFile(BaseModel):
     height: int
     params: list[float]
     pixel_center: Annotated[float, AfterValidator(_pixel_center)] = 0.5
+    # How it was come by, where it was not calibrated: for whoever opens the file
+    source: Literal["measured", "published", "given", "assumed", "self-calibrated"] | None = None
+    focal_deviation: float | None = None
+    note: str | None = None
 
 
 class _LightFile(BaseModel):
@@ -42,11 +46,6 @@ class _LightFile(BaseModel):
     source: Literal["measured", "published", "given", "assumed"] = "given"
 
 
-def read_camera_json(path: Path) -> CameraModel:
-    """camera.json -> camera, brought to our pixel convention."""
-    return camera_from_fields(read_json(path), str(path))
-
-
 def camera_from_fields(data: Any, where: str) -> CameraModel:
     """The camera of camera.json's fields, wherever they are written; `where` names the place in errors."""
     found = checked_fields(_CameraFile, data, where)
@@ -55,8 +54,19 @@ def camera_from_fields(data: Any, where: str) -> CameraModel:
 
 
 def write_camera_json(camera: CameraModel, path: Path) -> None:
+    write_whole(path, json.dumps(_fields_of(camera), indent=1) + "\n")
+
+
+def write_found_camera(camera: CameraModel, path: Path, source: str, deviation: float | None, note: str) -> None:
+    """camera.json of a camera that nobody calibrated: where it is from, the focal length's standard deviation as a
+    share of it, where known, and a sentence."""
+    told = {} if deviation is None else {"focal_deviation": round(deviation, 5)}
+    write_whole(path, json.dumps({**_fields_of(camera), "source": source, **told, "note": note}, indent=1) + "\n")
+
+
+def _fields_of(camera: CameraModel) -> dict[str, object]:
     data = {"model": camera.name, "width": camera.width, "height": camera.height, "params": list(camera.params)}
-    write_whole(path, json.dumps({**data, "pixel_center": 0.5}, indent=1) + "\n")
+    return {**data, "pixel_center": 0.5}
 
 
 def light_from_text(text: str) -> PhotometricCalibration:

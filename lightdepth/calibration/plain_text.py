@@ -7,6 +7,7 @@ OpenCV's calibration: there it is at (0, 0).
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,11 @@ def cannot_hold(path: Path, program: str, what: str, *models: str) -> InputError
 
 def read_colmap_camera(path: Path) -> CameraModel:
     """The camera of a cameras.txt that holds exactly one."""
-    cameras = read_cameras_text(path)
+    return only_camera(read_cameras_text(path), path)
+
+
+def only_camera(cameras: dict[int, CameraModel], path: Path) -> CameraModel:
+    """The camera of a file that has to hold exactly one."""
     if len(cameras) > 1:
         raise InputError(
             path,
@@ -53,11 +58,24 @@ def read_intrinsics(path: Path, size: tuple[int, int] | None) -> Pinhole:
     """A pinhole camera from its matrix, 3x3 or 4x4, row by row; `size` (width, height) is not in the file."""
     expected = "a camera matrix fx 0 cx / 0 fy cy / 0 0 1, as 9 numbers, or 16 with a fourth row and column 0 0 0 1"
     words = read_text(path, f"expected {expected}").translate(str.maketrans(",;[]", "    "))
-    numbers = to_numbers([w for line in rows(words) for w in line], str(path), expected)
+    lines = rows(words)
+    numbers = to_numbers([w for line in lines for w in line], str(path), expected)
+    if (widths := {len(line) for line in lines}) in ({8}, {12}):
+        what = "a TUM trajectory" if widths == {8} else "poses as KITTI has them"
+        raise InputError(
+            path, f"{what} ({len(lines)} lines of {widths.pop()} numbers), which hold no camera", f"expected {expected}"
+        )
     if len(numbers) not in (9, 16):
         raise InputError(path, f"{len(numbers)} numbers", f"expected {expected}")
     side = 3 if len(numbers) == 9 else 4
     matrix = np.array(numbers).reshape(side, side)
+    if size is not None and abs(matrix[:2, :3]).max() < 2 and min(size) >= 16:
+        matrix[:2] *= np.array(size, float)[:, None]
+        warnings.warn(
+            f"{path}: the matrix is in parts of the image's sides: scaled by {size[0]} and {size[1]} to fx "
+            f"{matrix[0, 0]:g}, fy {matrix[1, 1]:g}, cx {matrix[0, 2]:g}, cy {matrix[1, 2]:g} pixels",
+            stacklevel=4,
+        )
     (fx, skew, cx), (zero, fy, cy) = matrix[:2, :3]
     if not np.array_equal(matrix, _intrinsics(fx, fy, cx, cy, skew, side)) or zero:
         hint = "; it looks transposed" if not matrix[0, 2] and matrix[2, 0] else ""

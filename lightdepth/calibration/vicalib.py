@@ -1,9 +1,11 @@
 """vicalib's rig XML, as EndoMapper ships it: the geometry of the lens, and the photometry of light and response.
 
 Geometry: `camera/camera_model` with `type`, `width`, `height`, `params` = [ a; b; ... ]. The types known:
-`calibu_fu_fv_u0_v0` (pinhole), `..._k1_k2` (poly2: r (1 + k1 r² + k2 r⁴), Brown without tangential terms) and
-`..._kb4` (Kannala-Brandt). vicalib fits ellipses to images by integer pixel: the first one's centre is at (0, 0).
-(EndoMapper's own COLMAP runs, in COLMAP's convention, refined the same lens to a centre 0.6 and 0.7 pixels beyond.)
+`calibu_fu_fv_u0_v0` (pinhole), `..._k1_k2` (poly2: r (1 + k1 r² + k2 r⁴), Brown without tangential terms),
+`..._k1_k2_k3` (poly3, with k3 r⁶), `..._kb4` (Kannala-Brandt) and EndoMapper's `ocamcalib_cx_cy_a0_a2_a3_a4_e_f_g`
+(Scaramuzza with a1 = 0 and the stretch [[e, f], [g, 1]], as its photometric calibration has it). vicalib fits ellipses
+to images by integer pixel: the first one's centre is at (0, 0). (EndoMapper's own COLMAP runs, in COLMAP's convention,
+refined the same lens to a centre 0.6 and 0.7 pixels beyond.)
 
 Photometry: `gamma`; under `light/light_model` mu, P (metres, camera axes), D, sigma. Sigma and a vignetting are not
 part of our model: said in a warning. Elements beyond these are passed over. Entities and DTDs are refused.
@@ -20,7 +22,17 @@ import numpy as np
 from defusedxml import DefusedXmlException
 
 from lightdepth.calibration.plain_text import cannot_hold
-from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, camera_from_params
+from lightdepth.camera import (
+    Brown,
+    CameraModel,
+    FullBrown,
+    KannalaBrandt,
+    Pinhole,
+    Scaramuzza,
+    camera_from_params,
+    camera_of,
+    opencv_camera,
+)
 from lightdepth.errors import InputError
 from lightdepth.files.text import read_text, to_numbers
 from lightdepth.files.writing import write_whole
@@ -30,7 +42,8 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 _PINHOLE, _POLY2, _KB4 = "calibu_fu_fv_u0_v0", "calibu_fu_fv_u0_v0_k1_k2", "calibu_fu_fv_u0_v0_kb4"
-_COUNTS = {_PINHOLE: 4, _POLY2: 6, _KB4: 8}
+_POLY3, _OCAM = "calibu_fu_fv_u0_v0_k1_k2_k3", "ocamcalib_cx_cy_a0_a2_a3_a4_e_f_g"
+_COUNTS = {_PINHOLE: 4, _POLY2: 6, _POLY3: 7, _KB4: 8, _OCAM: 9}
 _FARTHEST_LIGHT_M = 0.1  # no light on an endoscope's tip is farther from the lens: beyond, the unit is wrong
 
 
@@ -45,9 +58,13 @@ def read_vicalib(path: Path) -> CameraModel:
         raise InputError(path, f"camera_model type {kind!r} is not known", f"expected one of {', '.join(_COUNTS)}")
     width, height = (_whole(model, tag, path) for tag in ("width", "height"))
     params = _numbers(model, "params", path, _COUNTS[kind])
-    if kind == _POLY2:
-        params += [0.0, 0.0]
-    name = {_PINHOLE: Pinhole.name, _POLY2: Brown.name, _KB4: KannalaBrandt.name}[kind]
+    if kind == _OCAM:
+        params = [*params[:3], 0.0, *params[3:]]
+    if kind in (_POLY2, _POLY3):
+        k1, k2, *k3 = params[4:]
+        numbers = [*params[:4], k1, k2, 0.0, 0.0, *k3]
+        return camera_of(lambda: opencv_camera(width, height, numbers), str(path)).with_pixel_center(0.0)
+    name = {_PINHOLE: Pinhole.name, _KB4: KannalaBrandt.name, _OCAM: Scaramuzza.name}[kind]
     return camera_from_params(name, width, height, params, str(path)).with_pixel_center(0.0)
 
 
@@ -56,12 +73,16 @@ def write_vicalib(camera: CameraModel, path: Path) -> None:
     params = camera.with_pixel_center(1.0).params  # half a pixel back, to vicalib's
     if isinstance(camera, KannalaBrandt):
         kind = _KB4
-    elif isinstance(camera, Brown) and camera.p1 == camera.p2 == 0:
+    elif isinstance(camera, FullBrown) and not any((camera.p1, camera.p2, camera.k4, camera.k5, camera.k6)):
+        kind, params = _POLY3, (*params[:6], camera.k3)
+    elif type(camera) is Brown and camera.p1 == camera.p2 == 0:
         kind, params = _POLY2, params[:6]
+    elif isinstance(camera, Scaramuzza) and camera.a1 == 0:
+        kind, params = _OCAM, (*params[:3], *params[4:])
     elif isinstance(camera, Pinhole):
         kind = _PINHOLE
     else:
-        what = "OPENCV camera with tangential terms" if isinstance(camera, Brown) else f"{camera.name} camera"
+        what = f"{camera.name} camera with tangential terms" if isinstance(camera, Brown) else f"{camera.name} camera"
         raise cannot_hold(path, "vicalib's XML", what, "OPENCV_FISHEYE", "PINHOLE")
     write_whole(
         path,

@@ -17,15 +17,18 @@ Parameters are in COLMAP's order; SCARAMUZZA's are `cx cy a0 a1 a2 a3 a4 c d e`.
 
 from lightdepth.camera.fisheye import KannalaBrandt, Scaramuzza
 from lightdepth.camera.model import CameraModel
-from lightdepth.camera.params import CAMERA_MODELS, camera_from_params
-from lightdepth.camera.perspective import Brown, Pinhole
+from lightdepth.camera.params import CAMERA_MODELS, camera_from_params, camera_of, opencv_camera
+from lightdepth.camera.perspective import Brown, FullBrown, Pinhole
 
 __all__ = [
     "CAMERA_MODELS",
     "Brown",
     "CameraModel",
+    "FullBrown",
     "KannalaBrandt",
     "Pinhole",
     "Scaramuzza",
     "camera_from_params",
+    "camera_of",
+    "opencv_camera",
 ]

@@ -1,4 +1,4 @@
-"""Cameras that distort the plane z = 1: pinhole and Brown-Conrady."""
+"""Cameras that distort the plane z = 1: pinhole, Brown-Conrady, and OpenCV's longer form of it."""
 
 from __future__ import annotations
 
@@ -50,10 +50,14 @@ class Brown(FocalCamera):
         """The radius within which the distortion can be inverted; infinity where it can everywhere."""
         return _fold(self.k1, self.k2, float(np.hypot(self.p1, self.p2)))
 
+    def _radial(self, r2: Array) -> tuple[Array, Array]:
+        """The radial factor at squared radius r², and its slope over r²."""
+        return 1 + r2 * (self.k1 + self.k2 * r2), self.k1 + 2 * self.k2 * r2
+
     def _distort(self, plane: Array) -> Array:
         x, y = plane[..., 0], plane[..., 1]
         r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + self.k2 * r2)
+        radial, _ = self._radial(r2)
         result: Array = namespace(plane).stack(
             [
                 x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
@@ -66,8 +70,8 @@ class Brown(FocalCamera):
     def _newton(self, plane: Array, distorted: Array) -> Array:
         """One step towards distort(plane) = distorted."""
         xp, x, y = namespace(plane), plane[..., 0], plane[..., 1]
-        r2 = x * x + y * y
-        radial, slope = 1 + r2 * (self.k1 + self.k2 * r2), 2 * self.k1 + 4 * self.k2 * r2
+        radial, slope = self._radial(x * x + y * y)
+        slope = 2 * slope
         xx = radial + slope * x * x + 2 * self.p1 * y + 6 * self.p2 * x
         xy = slope * x * y + 2 * self.p1 * x + 2 * self.p2 * y
         yy = radial + slope * y * y + 6 * self.p1 * y + 2 * self.p2 * x
@@ -91,7 +95,7 @@ class Brown(FocalCamera):
         r = xp.linalg.norm(fixed, axis=-1, keepdims=True)
         far = 1.5 * max(1.0, 0.0 if 0 in r.shape else float(r.max())) + 1.0
         radius = np.linspace(0, min(limit, far), TABLE)
-        table = radius * (1 + radius**2 * (self.k1 + radius**2 * self.k2))
+        table = radius * self._radial(radius**2)[0]
         plane = fixed / xp.clip(r, 1e-12, None) * interpolated(r, table, radius)
         for target in [fixed] * 9 + [distorted]:
             plane = self._newton(plane, target)
@@ -101,6 +105,46 @@ class Brown(FocalCamera):
         rounding = 32 * float(xp.finfo(fixed.dtype).eps) * (1 + r[..., 0])
         solved = error < 1e-6 / self.focal_length + rounding
         return rays_through_plane(plane), solved & (xp.linalg.norm(plane, axis=-1) < limit)
+
+
+@dataclass(frozen=True)
+class FullBrown(Brown):
+    """Brown-Conrady with OpenCV's further radial terms, (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)
+    (COLMAP's FULL_OPENCV): what cv2.calibrateCamera gives unless it is told not to."""
+
+    k3: float
+    k4: float
+    k5: float
+    k6: float
+
+    name: ClassVar[str] = "FULL_OPENCV"
+
+    def _max_radius(self) -> float:
+        return _full_fold(self)
+
+    def _radial(self, r2: Array) -> tuple[Array, Array]:
+        above, above_slope = _cubic(r2, self.k1, self.k2, self.k3)
+        below, below_slope = _cubic(r2, self.k4, self.k5, self.k6)
+        return above / below, (above_slope * below - above * below_slope) / (below * below)
+
+
+def _cubic(t: Array, a: float, b: float, c: float) -> tuple[Array, Array]:
+    """1 + a t + b t² + c t³ and its slope."""
+    return 1 + t * (a + t * (b + t * c)), a + t * (2 * b + 3 * c * t)
+
+
+@lru_cache(maxsize=64)
+def _full_fold(camera: FullBrown) -> float:
+    """As _fold, to a thousandth: its polynomials' degree is too high for roots that can be trusted."""
+    r = np.linspace(0, 30, 30001)[1:]
+    with np.errstate(all="ignore"):
+        radial, slope = camera._radial(r * r)
+    p, regular = float(np.hypot(camera.p1, camera.p2)), _cubic(r * r, camera.k4, camera.k5, camera.k6)[0] > 0
+    for angle in np.linspace(0, np.pi, 91 if p else 1):
+        a, b = p * np.cos(angle), p * np.sin(angle)
+        along, across = radial + 2 * r * r * slope + 6 * a * r, radial + 2 * a * r
+        regular &= (along > 0) & (along * across > 4 * b * b * r * r)
+    return float(r[regular.argmin()]) if not regular.all() else float("inf")
 
 
 @lru_cache(maxsize=64)

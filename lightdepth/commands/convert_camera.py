@@ -14,7 +14,7 @@ from lightdepth.errors import InputError
 def convert_camera(
     file: Path,
     output: Path,
-    model: Literal["PINHOLE", "OPENCV", "OPENCV_FISHEYE", "SCARAMUZZA"] | None = None,
+    model: Literal["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "SCARAMUZZA"] | None = None,
     size: tuple[int, int] | None = None,
     to: Literal["json", "vicalib", "opencv", "colmap", "ocamcalib", "intrinsics", "intrinsics4x4"] | None = None,
     mask: Path | None = None,

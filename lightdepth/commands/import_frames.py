@@ -24,6 +24,7 @@ from lightdepth.importing.scan import scanned, write_measures
 from lightdepth.importing.selection import KEPT, Choice, selected
 from lightdepth.importing.source import content_hash, open_source
 from lightdepth.reporting.run import recorded, run_folder
+from lightdepth.uncalibrated import with_camera
 
 DEFAULT_RATE = 5.0
 
@@ -64,10 +65,11 @@ def import_frames(
     if not keep_names:
         paths = [name for name in (*source.files, "light", "overlay_mask") if arguments[name] is not None]
         arguments |= {name: "(name left out)" for name in paths if "=" not in str(arguments[name])}
-    opened, files = open_source(source)
-    if opened.video is not None and choice.rate is None and choice.every is None:
-        choice = replace(choice, rate=DEFAULT_RATE)
     with run_folder(output, "import", arguments, overwrite) as run:
+        calibrated, found_camera = with_camera(source, run)
+        opened, files = open_source(calibrated)
+        if opened.video is not None and choice.rate is None and choice.every is None:
+            choice = replace(choice, rate=DEFAULT_RATE)
         if not keep_names:
             run.record["command"] = ["lightdepth", "import", "(names left out; the options are in arguments)"]
         run.record["inputs"] = {"source": {"sha256_of_contents": content_hash(files)}}
@@ -87,6 +89,8 @@ def import_frames(
                     " ".join(f"{f.found} {f.cure}" for f in found) or "look at the frames",
                 )
             pictures = write_pictures(run, opened, scan, fate, regions, geometry, shape.deinterlace)
+            if found_camera is not None and geometry.camera is not None:
+                found_camera.write(run.folder / "camera.json", geometry.camera)
         known = facts(opened, scan, fate, regions, geometry, choice, source.data if keep_names else None)
         axis = (scan.times, "time [s]") if np.isfinite(scan.times).all() else (scan.rows, "frame")
         page = import_page(

@@ -16,6 +16,7 @@ from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
+from lightdepth.uncalibrated import open_frames
 
 
 def predict(
@@ -52,28 +53,29 @@ def predict(
     factor = None if uncertainty is None else read_factor(uncertainty, model.name)
     if refine:
         model = RefinedModel(model, RefineConfig(steps=refine))
-    frames = source.open()
-    with run_folder(output, "predict", arguments, overwrite) as run, Progress("Predicting", len(frames)) as bar:
+    with run_folder(output, "predict", arguments, overwrite) as run:
+        frames = open_frames(source, run).without_truth()
         run.hash_inputs(data=source.data)
         if previews:
             (run.folder / "previews").mkdir()
         nothing = 0
-        for i in range(len(frames)):
-            try:
-                frame = frames[i]
-            except InputError as error:
-                run.fail(frames.names[i], str(error))
-                continue
-            prediction = model(frame)
-            nothing += not prediction.valid.any()
-            if factor is not None and prediction.uncertainty is not None:
-                prediction = replace(prediction, uncertainty=prediction.uncertainty * np.float32(factor))
-            prediction.save(run.folder / f"{frame.name}.npz")
-            if previews:
-                colors = colored_distance(prediction.distance, prediction.valid)
-                picture = side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)])
-                (run.folder / "previews" / f"{frame.name}.png").write_bytes(png(picture))
-            bar.advance()
+        with Progress("Predicting", len(frames)) as bar:
+            for i in range(len(frames)):
+                try:
+                    frame = frames[i]
+                except InputError as error:
+                    run.fail(frames.names[i], str(error))
+                    continue
+                prediction = model(frame)
+                nothing += not prediction.valid.any()
+                if factor is not None and prediction.uncertainty is not None:
+                    prediction = replace(prediction, uncertainty=prediction.uncertainty * np.float32(factor))
+                prediction.save(run.folder / f"{frame.name}.npz")
+                if previews:
+                    colors = colored_distance(prediction.distance, prediction.valid)
+                    picture = side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)])
+                    (run.folder / "previews" / f"{frame.name}.png").write_bytes(png(picture))
+                bar.advance()
         if len(run.record["failures"]) == len(frames):
             raise InputError(source.data, "no frame could be read", f"the first: {run.record['failures'][0]['reason']}")
         if nothing:

@@ -3,27 +3,30 @@
 | tree | colour | depth | camera |
 |---|---|---|---|
 | first edition | `N_color.png` or `NNNN_color.png` | `NNNN_depth.tiff` | C3VD |
-| first edition, sorted into folders (EndoGSLAM) | the same in `color/` | the same in `depth/` | C3VD |
+| first edition, sorted into folders | the same in `color/` | the same in `depth/` | C3VD |
+| that, undistorted by EndoGSLAM's scripts | the same | 8 bits, no truth | C3VD_UNDISTORTED |
 | second and third (C3VDv2, C3VDv3) | `rgb/NNNN.png` | `depth/NNNN_depth.tiff` | C3VD_V2 |
 
 Colour and depth are paired by integer. Depth 0 (no data) and 65535 (clipped at 100 mm) are both unknown. Poses
 (`pose.txt`) are camera-to-world [mm], 16 numbers a line, column by column in the present release and row by row in the
 oldest: each line shows which. Screenings and deformations have no depth. The lenses are the authors' Scaramuzza models;
-the light was never calibrated: EndoMapper's values are assumed (same endoscope).
+the light was never calibrated: EndoMapper's values are assumed (same endoscope). Undistorted images are told by their
+corners, which the octagon leaves black and undistorting fills, or by color_raw/ beside color/.
 """
 
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lightdepth.camera import CameraModel, Scaramuzza
+from lightdepth.camera import CameraModel, Pinhole, Scaramuzza
 from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
-from lightdepth.datasets.sequence import FrameSequence, numbered_files
+from lightdepth.datasets.sequence import FrameSequence, corners, numbered_files, spread_images
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame
@@ -60,7 +63,10 @@ C3VD_V2 = Scaramuzza(
     0.0,
 ).with_pixel_center(0.0)
 """The camera of C3VD, second and third edition (as the third's tools have it), at full size."""
+C3VD_UNDISTORTED = Pinhole(1350, 1080, 802.319, 801.885, 668.286, 547.733).with_pixel_center(0.0)
+"""The camera of C3VD, first edition, after EndoGSLAM's scripts have undistorted it, at full size."""
 FULL_SCALE_MM = 100.0
+_TISSUE = 0.1  # brightness that no black corner reaches
 _DEPTH = DepthCode("C3VD", 65535, FULL_SCALE_MM, clipped=65535)
 
 
@@ -121,7 +127,8 @@ def read_c3vd(
         )
     if camera is None:
         width, height = image_size(images[0])
-        whole = tree.camera
+        undistorted = (path / "color_raw").is_dir() or _fills_the_corners(spread_images(images))
+        whole = _undistorted_camera(path, tree) if undistorted else tree.camera
         if abs(width / height / (whole.width / whole.height) - 1) > 0.01:
             raise InputError(
                 path,
@@ -168,6 +175,34 @@ def write_c3vd(frames: Sequence[Frame], path: Path, tree: str = "v1") -> None:
             lines.append(",".join(f"{v:.9g}" for v in frame.true_world_from_cam.T.ravel()))
     if lines:
         (path / "pose.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _fills_the_corners(images: Sequence[np.ndarray]) -> bool:
+    """Whether tissue shows in the corners of images (H, W, 3), where C3VD's octagon leaves them black."""
+    if not images:
+        return False  # refused by name when they are asked for
+    patch = max(2, len(images[0]) // 40)
+    brightest = np.max([image.max(-1) for image in images if image.shape == images[0].shape], axis=0)
+    return sum(float(np.median(brightest[rows, columns])) > _TISSUE for rows, columns in corners(patch)) >= 3
+
+
+def _undistorted_camera(path: Path, tree: _Tree) -> CameraModel:
+    """The camera of EndoGSLAM's tree. Raises InputError for images that somebody else undistorted."""
+    found = "no black corners, which C3VD's octagon has: the images look undistorted or cropped"
+    fx, fy, cx, cy = C3VD_UNDISTORTED.with_pixel_center(1.0).params
+    if tree.colour != "color":
+        raise InputError(
+            path,
+            found,
+            "give their camera with --camera FILE; that of EndoGSLAM's scripts is PINHOLE at 1350x1080, "
+            f"fx {fx:g} fy {fy:g} cx {cx:g} cy {cy:g}, pixel_center 0.0",
+        )
+    warnings.warn(
+        f"{path}: {found}; sorted into color/ and depth/, they are taken for EndoGSLAM's, undistorted to a pinhole of "
+        f"fx {fx:g} at 1350x1080. Give --camera FILE where another program undistorted them",
+        stacklevel=6,
+    )
+    return C3VD_UNDISTORTED
 
 
 def _tree(path: Path) -> _Tree | None:

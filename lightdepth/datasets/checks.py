@@ -13,7 +13,8 @@ and the file's own does not.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +45,9 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
     Raises InputError where poses and truth contradict each other and another reading fits; warns of what is unlikely.
     A frame that cannot be read is left out: it is refused when it is asked for.
     """
-    frames = readable(sequence, sequence.sampled)
+    frames, no_truth = _looked_at(sequence, sequence.sampled)
+    for message in no_truth:
+        warnings.warn(f"{sequence.source}: {message}; what needs no truth goes on without it", stacklevel=3)
     if not frames:
         return sequence
     for message in (
@@ -76,12 +79,27 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
 
 def unusable_truth(sequence: FrameSequence) -> list[str]:
     """Why nothing can be judged by the truth of a sequence: it contradicts its poses, or is not in millimetres."""
-    frames = readable(sequence, sequence.sampled)
+    frames, no_truth = _looked_at(sequence, sequence.sampled)
     fit = _fit_of(sequence, frames) if frames else None
     return [
+        *no_truth,
         *_unit_doubts(frames),
         *([_contradiction(fit)] if fit is not None and fit.error_as_given > CONTRADICTION else []),
     ]
+
+
+def _looked_at(sequence: FrameSequence, rows: Iterable[int]) -> tuple[list[Frame], list[str]]:
+    """The frames that can be read, some without their true distance, and why that cannot be read of the first."""
+    frames, no_truth = [], []
+    blind = sequence.without_truth()
+    for i in rows:
+        try:
+            frames.append(sequence[i])
+        except InputError as error:
+            with suppress(InputError):
+                frames.append(blind[i])
+                no_truth.append(f"the true distance of {sequence.names[i]} cannot be read ({error})")
+    return frames, no_truth[:1]
 
 
 # ---- camera, light, mask, image

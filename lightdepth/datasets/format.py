@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -22,6 +23,7 @@ from lightdepth.datasets.sequence import (
     warn_of_gaps,
     warn_of_orientation,
 )
+from lightdepth.errors import InputError
 from lightdepth.files.depths import white_of
 from lightdepth.files.images import read_image
 from lightdepth.frame import Frame, frame_number
@@ -40,6 +42,9 @@ class Reader(Protocol):
         *,
         bit_depth: int | None = None,
     ) -> FrameSequence: ...
+
+
+_NEAREST_MM = 1.0  # no frame shows nothing but wall that is nearer than this
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,13 @@ class DepthCode:
     def distance(self, file: Path, ray_z: np.ndarray) -> np.ndarray:
         """(H, W) float32 distance along the ray [mm], 0 where unknown, of an image with these rays' z."""
         code = read_code(file, ray_z, self.whose)
+        farthest = float(code.max()) / self.full * self.full_mm
+        if 0 < farthest < _NEAREST_MM:
+            raise InputError(
+                file,
+                f"depth codes up to {code.max()}, which would be {farthest:.2g} mm",
+                f"expected {self.whose}'s codes of 16 bits: these look like 8 bits kept in 16",
+            )
         return along_ray(code.astype(np.float32) / self.full * self.full_mm, (code > 0) & (code < self.clipped), ray_z)
 
 
@@ -115,7 +127,7 @@ def frames_of(
         if mask is not None and not bordered:
             warn_of_border(path, mask)
 
-    def load(i: int) -> Frame:
+    def load(i: int, with_truth: bool = True) -> Frame:
         return Frame(
             called[i],
             read_image(images[i], white),
@@ -123,8 +135,8 @@ def frames_of(
             light,
             mask,
             time=None if times is None else times[i],
-            true_distance=None if distance is None else distance(i),
+            true_distance=None if distance is None or not with_truth else distance(i),
             true_world_from_cam=None if poses is None else poses[i],
         )
 
-    return FrameSequence(called, load, str(path))
+    return FrameSequence(called, load, str(path), load_blind=partial(load, with_truth=False))

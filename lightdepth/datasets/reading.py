@@ -13,7 +13,7 @@ from lightdepth.camera import CameraModel
 from lightdepth.datasets import c3vd, endomapper, endoslam, folder, hamlyn, scared, simcol
 from lightdepth.datasets.checks import check_sequence
 from lightdepth.datasets.format import Format
-from lightdepth.datasets.sequence import FrameSequence, legible, list_images, read_mask
+from lightdepth.datasets.sequence import FrameSequence, legible, list_images, no_images, read_mask
 from lightdepth.datasets.video import VideoFile, read_video, video_at
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size
@@ -165,8 +165,9 @@ def _is_sequence(path: Path) -> bool:
 
 
 def _read_camera(file: Path, folder: Path) -> CameraModel:
-    """The camera of a file; intrinsics.txt, which holds no size, is for the images in the folder."""
-    return read_camera(file, _size_of_images(folder) if file.suffix.lower() == ".txt" else None)
+    """The camera of a file; one that holds no size, as intrinsics.txt, is for the images in the folder."""
+    first = None if file.suffix.lower() == ".xml" else legible(list_images(folder))
+    return read_camera(file, None if first is None else image_size(first))
 
 
 def _open_video(
@@ -176,12 +177,11 @@ def _open_video(
     mask: str | Path | None,
     map_camera: CameraModel | None,
 ) -> FrameSequence:
-    """The frames of a video; intrinsics.txt, which holds no size, is for the video's."""
+    """The frames of a video; a camera's file that holds no size, as intrinsics.txt, is for the video's."""
     chosen = None
     if camera is not None:
         opened = VideoFile(video)
-        size = (opened.width, opened.height) if Path(camera).suffix.lower() == ".txt" else None
-        chosen = read_camera(Path(camera), size)
+        chosen = read_camera(Path(camera), (opened.width, opened.height))
         check_image_size(str(video), opened.width, opened.height, chosen)
     chosen_light = None if light is None else _given(read_light(light))
     chosen_mask = read_mask(Path(mask)) if mask is not None else None
@@ -198,6 +198,22 @@ def _size_of_images(folder: Path) -> tuple[int, int] | None:
     """Width and height of the first image, where there is one."""
     image = _first_image(folder)
     return None if image is None else image_size(image)
+
+
+def size_of_frames(path: Path, format: str | None = None) -> tuple[int, int]:
+    """Width and height of the frames at `path`, a video or a folder, as far as they need no camera."""
+    video = video_at(path) if format in (None, "video") and path.exists() else None
+    if video is not None:
+        opened = VideoFile(video)
+        return opened.width, opened.height
+    if not path.is_dir():
+        found = "is a file" if path.is_file() else "does not exist"
+        raise InputError(path, found, "expected a folder of frames, or a video such as .mp4 or .mov")
+    data_set = _BY_NAME.get(format or "") or _looks_like(path) or folder.FORMAT
+    first = legible(list_images(data_set.images(path)))
+    if first is None:
+        raise InputError(path, f"{no_images(data_set.images(path))}", "expected frames such as 000123.png")
+    return image_size(first)
 
 
 def _first_image(folder: Path) -> Path | None:

@@ -29,7 +29,7 @@ def write_scared(frames: Sequence[Frame], path: Path, archives: bool = True, met
     if not len(frames):
         raise InputError(path, "no frames to write", "expected at least one")
     camera = frames[0].camera
-    if not isinstance(camera, Pinhole | Brown) or camera.width % 2 or camera.height % 2:
+    if type(camera) not in (Pinhole, Brown) or camera.width % 2 or camera.height % 2:
         raise InputError(
             path, f"{camera.name} {camera.width}x{camera.height}", "expected a PINHOLE or OPENCV, even sizes"
         )

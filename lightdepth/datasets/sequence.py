@@ -29,6 +29,7 @@ class FrameSequence(Sequence[Frame]):
     """Frames by index, each read from disk when it is asked for. `names` and `numbers` cost no reading.
 
     `sampled` are the frames by which the sequence is checked when it is opened: first, middle and last where left out.
+    `load_blind` loads a frame without its true distance, where there may be one.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class FrameSequence(Sequence[Frame]):
         load: Callable[[int], Frame],
         source: str,
         sampled: Sequence[int] | None = None,
+        load_blind: Callable[[int], Frame] | None = None,
     ):
         if not names:
             raise InputError(source, "no frames in it", "expected images with a number in their names")
@@ -44,6 +46,7 @@ class FrameSequence(Sequence[Frame]):
         self.numbers = [frame_number(name) for name in names]
         self.source = source
         self._load = load
+        self._load_blind = load_blind
         self.sampled = tuple(sorted({0, len(names) // 2, len(names) - 1})) if sampled is None else tuple(sampled)
         twice = {n for n in self.numbers if self.numbers.count(n) > 1} if len(set(self.numbers)) < len(names) else set()
         if twice:
@@ -71,7 +74,14 @@ class FrameSequence(Sequence[Frame]):
 
     def at(self, rows: Sequence[int]) -> FrameSequence:
         """The frames at these rows, in this order."""
-        return FrameSequence([self.names[i] for i in rows], _Rows(self._load, rows), self.source)
+        blind = None if self._load_blind is None else _Rows(self._load_blind, rows)
+        return FrameSequence([self.names[i] for i in rows], _Rows(self._load, rows), self.source, load_blind=blind)
+
+    def without_truth(self) -> FrameSequence:
+        """The frames without their true distance, which is not read: whatever is wrong with it does not matter."""
+        if self._load_blind is None:
+            return self
+        return FrameSequence(self.names, self._load_blind, self.source, self.sampled)
 
     def image_size(self) -> tuple[int, int]:
         """Width and height of the frames; reads the first."""
@@ -266,12 +276,18 @@ def warn_of_gaps(source: Path, numbers: Sequence[int], known: Container[int]) ->
 def found_mask(images: Sequence[Path], white: float | None = None, count: int = 8) -> np.ndarray | None:
     """`border_mask` of a sequence's image files, from `count` of them spread over it; None where there is no border, or
     none of them can be read. `white` is as for `read_image`."""
+    read = spread_images(images, white, count)
+    mask = border_mask(read) if read else np.ones((1, 1), bool)
+    return None if mask.all() else mask
+
+
+def spread_images(images: Sequence[Path], white: float | None = None, count: int = 8) -> list[np.ndarray]:
+    """`count` images (H, W, 3) spread over a sequence's files, those of them that can be read."""
     read = []
     for image in images[:: max(1, len(images) // count)][:count]:
         with suppress(InputError):  # refused by name when it is asked for
             read.append(read_image(image, white))
-    mask = border_mask(read) if read else np.ones((1, 1), bool)
-    return None if mask.all() else mask
+    return read
 
 
 def border_mask(images: Sequence[np.ndarray]) -> np.ndarray:
@@ -300,9 +316,9 @@ def border_region(images: Sequence[np.ndarray]) -> np.ndarray:
     smooth = [cv2.medianBlur(np.rint(255 * top).astype(np.uint8), 3) for top in tops]
     brightest = np.max(smooth, axis=0)
     patch = max(2, height // 40)
-    corners = np.concatenate([brightest[rows, columns].ravel() for rows, columns in _corners(patch)])
-    level = float(np.median(corners))
-    threshold = 16.0 if level >= 16 else min(40.0, max(16.0, level + 1.5 * (np.quantile(corners, 0.9) - level) + 6))
+    dark = np.concatenate([brightest[rows, columns].ravel() for rows, columns in corners(patch)])
+    level = float(np.median(dark))
+    threshold = 16.0 if level >= 16 else min(40.0, max(16.0, level + 1.5 * (np.quantile(dark, 0.9) - level) + 6))
     size = max(3, round(0.01 * height)) | 1
     closed = cv2.morphologyEx(
         (brightest > threshold).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)
@@ -318,6 +334,7 @@ def border_region(images: Sequence[np.ndarray]) -> np.ndarray:
     return (opened if opened.any() else filled).astype(bool)
 
 
-def _corners(size: int) -> list[tuple[slice, slice]]:
+def corners(size: int) -> list[tuple[slice, slice]]:
+    """Rows and columns of the four corners of an image, `size` pixels wide and high."""
     first, last = slice(0, size), slice(-size, None)
     return [(first, first), (first, last), (last, first), (last, last)]

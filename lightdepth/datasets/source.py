@@ -8,6 +8,7 @@ from pathlib import Path
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.reading import FormatName, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
+from lightdepth.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,8 @@ class SequenceSource:
     endoslam or endomapper. Left out, it is told by the files."""
     camera: Path | None = None
     """Calibration file of the camera, used instead of the folder's own. Left out, the folder's own, else that of the
-    map, where one is given."""
+    map, where one is given. `auto` finds the camera from the frames' motion, in import, predict, densify, live and
+    sparse."""
     light: str | None = None
     """Light of the endoscope, used instead of the folder's own: a light.json, a photometric XML, or values such as
     gamma=2.2,mu=0 (response and spread). Left out, the folder's own, else an assumed one."""
@@ -31,12 +33,30 @@ class SequenceSource:
     bit_depth: int | None = None
     """Bits of a sample in pictures that are stored in more than 8, e.g. 10 where white is 1023; left out, what the
     files say, else what their highest values show. A larger one reads the same numbers as darker."""
+    fov: float | None = None
+    """Field of view across the image's width, degrees, at which --camera auto (which it implies) starts, and which is
+    assumed where the frames do not connect. A larger one means a shorter focal length. Left out, several are tried."""
+
+    @property
+    def asks_for_camera(self) -> bool:
+        """Whether the camera is to be found from the frames."""
+        auto = self.camera == Path("auto") and not self.camera.exists()
+        if self.fov is not None and self.camera is not None and not auto:
+            raise InputError("--fov", f"with the calibration {self.camera}", "give one of them")
+        return auto or self.fov is not None
 
     def open(self, map_camera: CameraModel | None = None) -> FrameSequence:
         """The frames; `map_camera` as for open_sequence. Raises InputError where they cannot be read."""
+        if self.asks_for_camera:
+            raise InputError(
+                "--camera auto" if self.fov is None else "--fov",
+                "this verb finds no camera",
+                f"make a sequence with one first: lightdepth import {self.data} --camera auto -o DATA",
+            )
         return open_sequence(self.data, self.format, self.camera, self.light, self.mask, map_camera, self.bit_depth)
 
     @property
     def files(self) -> dict[str, Path | None]:
         """The files and folders that are read, by the name of their option."""
-        return {"data": self.data, "camera": self.camera, "mask": self.mask}
+        camera = None if self.asks_for_camera else self.camera
+        return {"data": self.data, "camera": camera, "mask": self.mask}

@@ -288,8 +288,8 @@ def read_video(
         raise InputError(
             path,
             "no camera.json beside it",
-            'give --camera FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), or a '
-            "map that has one",
+            'give --camera FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), '
+            "--camera auto to find it from the motion (--fov 70 where to start), or a map that has one",
         )
     if mask is None:
         mask = border_of(video)

@@ -1,4 +1,5 @@
-"""TUM trajectories: time, position and quaternion of the camera in the world, a line each."""
+"""TUM trajectories: time, position and quaternion of the camera in the world, a line each; KITTI's poses are read too:
+12 numbers a line, the upper rows of the matrix camera to world, the first line frame 0's."""
 
 from __future__ import annotations
 
@@ -22,18 +23,21 @@ def write_tum(path: Path, times: Iterable[float], world_from_cam: Iterable[np.nd
 
 
 def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) and poses world_from_cam (n, 4, 4) of a TUM trajectory."""
+    """Times (n,) and poses world_from_cam (n, 4, 4) of a TUM trajectory, or of KITTI's poses, whose times are the
+    numbers of the frames."""
     try:
         rows = np.loadtxt(path, ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(
             path, f"not a TUM trajectory ({error})", "expected lines of 8 numbers: t tx ty tz qx qy qz qw"
         ) from error
-    if rows.shape[1] != 8:
-        raise InputError(path, f"{rows.shape[1]} columns", "expected 8: t tx ty tz qx qy qz qw")
+    if rows.shape[1] not in (8, 12):
+        raise InputError(path, f"{rows.shape[1]} columns", "expected 8: t tx ty tz qx qy qz qw, or 12 (KITTI's poses)")
     if not np.isfinite(rows).all():
         line = int((~np.isfinite(rows)).any(1).argmax()) + 1
         raise InputError(path, f"line {line} has NaN or infinite numbers", "expected a pose for each frame")
+    if rows.shape[1] == 12:
+        return _kitti(rows, path)
     length = np.linalg.norm(rows[:, 4:], axis=1)
     if (length < 1e-6).any():
         raise InputError(
@@ -43,3 +47,14 @@ def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]
     return rows[:, 0], poses
+
+
+def _kitti(rows: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    turns = poses[:, :3, :3]
+    wrong = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 1e-3
+    if wrong.any() or (np.linalg.det(turns) < 0).any():
+        line = int((wrong | (np.linalg.det(turns) < 0)).argmax()) + 1
+        raise InputError(path, f"line {line}: its 12 numbers hold no rotation", "expected r r r t, three times")
+    return np.arange(len(rows), dtype=float), poses

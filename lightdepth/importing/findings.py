@@ -143,7 +143,8 @@ def of_camera(size: tuple[int, int], camera_size: tuple[int, int] | None, why: s
         findings.append(
             Finding(
                 f"No calibration{reason}: camera.json was not written.",
-                "Calibrate the endoscope and give --camera FILE; without it nothing can be predicted or densified.",
+                "Calibrate the endoscope and give --camera FILE, or --camera auto to find it from the motion; "
+                "without a camera nothing can be predicted or densified.",
             )
         )
     elif camera_size != size:

@@ -97,8 +97,7 @@ def _of_video(video: VideoFile, camera: Path | None, light: str | None, mask: Pa
             why = str(error).replace(str(video.path.parent), "the folder")
     chosen = found.camera if found is not None else None
     if camera is not None:
-        size = (video.width, video.height) if camera.suffix.lower() == ".txt" else None
-        chosen = read_camera(camera, size)
+        chosen = read_camera(camera, (video.width, video.height))
     beside = found.mask if found is not None else None
     return Source(
         numbers=list(range(len(video))),
@@ -116,7 +115,7 @@ def _of_video(video: VideoFile, camera: Path | None, light: str | None, mask: Pa
 def _sequence(source: SequenceSource) -> tuple[FrameSequence, str]:
     """Frames of a folder; where only the camera is missing, with one that stands in, and what was said of it."""
     try:
-        return source.open(), ""
+        return source.open().without_truth(), ""
     except InputError as error:
         images = [] if source.camera is not None or not source.data.is_dir() else _images(source.data)
         if not images:
@@ -124,7 +123,7 @@ def _sequence(source: SequenceSource) -> tuple[FrameSequence, str]:
         width, height = image_size(images[0])
         try:
             stand_in = Pinhole(width, height, width, width, width / 2, height / 2)
-            return source.open(stand_in), "none was found"
+            return source.open(stand_in).without_truth(), "none was found"
         except InputError:
             raise error from None
 

@@ -171,7 +171,7 @@ def _extract(
 ) -> None:
     reader = pc.ImageReaderOptions()
     reader.camera_model, reader.mask_path = camera.name, work / "masks"
-    reader.camera_params = ",".join(repr(p) for p in camera.params)
+    reader.camera_params = ",".join(repr(float(p)) for p in camera.params)
     options = pc.FeatureExtractionOptions()
     options.use_gpu, options.num_threads = False, config.num_threads
     options.sift.max_num_features, options.sift.peak_threshold = config.max_features, config.peak_threshold

@@ -99,6 +99,7 @@ def select(
     paths = _paths(output, no_frames, overwrite)
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=config.bit_depth)
     sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, reading)
+    frames = frames.without_truth()
     settings: dict[str, object]
     if sparse_map is not None and map is not None:
         verdicts, how = _by_map(frames, sparse_map, map, config.map_rules)

@@ -1,0 +1,144 @@
+"""Frames of an endoscope whose calibration nobody has: opened with a camera found from their own motion.
+
+`--camera auto` finds it, `--fov DEGREES` is where to start and what is assumed where the frames do not connect. Some
+frames of a stretch are mapped by pycolmap (sfm.self_calibration); the camera is written to camera.json in the run
+folder with its deviation, and said.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from lightdepth.calibration import write_camera
+from lightdepth.calibration.json_files import write_found_camera
+from lightdepth.camera import CameraModel
+from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets.reading import size_of_frames
+from lightdepth.errors import InputError
+from lightdepth.reporting.run import Run
+from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.self_calibration import SelfCalibration, across, self_calibrated
+
+FRAMES = 24
+"""Frames that are mapped to find a camera."""
+_SECONDS_APART = 0.2  # an endoscope moves some millimetres in that time
+_PLACES = 0.5, 0.25, 0.75  # of the sequence, where a stretch is looked for
+
+
+def open_frames(
+    source: SequenceSource, run: Run, map_camera: CameraModel | None = None, config: SfmConfig | None = None
+) -> FrameSequence:
+    """The frames, under a camera that is found first where the source asks for that; written to the run's camera.json.
+    `config` is how they are mapped for it.
+
+    Raises InputError where no camera can be found and no field of view was given to assume.
+    """
+    if not source.asks_for_camera:
+        return source.open(map_camera)
+    if map_camera is not None:
+        check_camera_asked(source)
+    return with_camera(source, run, config)[0].open()
+
+
+def check_camera_asked(source: SequenceSource) -> None:
+    """Raises InputError where a camera is to be found for frames that have a map."""
+    if source.asks_for_camera:
+        raise InputError(
+            "--camera auto" if source.fov is None else "--fov",
+            "with a map, which has a camera already",
+            "leave it out, or leave the map out, which is then made with the camera that is found",
+        )
+
+
+def with_camera(
+    source: SequenceSource, run: Run, config: SfmConfig | None = None
+) -> tuple[SequenceSource, Found | None]:
+    """The source with its camera in the run's camera.json, found first where it asks for that; and how it was found."""
+    if not source.asks_for_camera:
+        return source, None
+    found, file = found_camera(source, run, config), run.folder / "camera.json"
+    found.write(file)
+    return replace(source, camera=file, fov=None), found
+
+
+@dataclass(frozen=True)
+class Found:
+    """A camera that nobody calibrated, and what camera.json says of it."""
+
+    camera: CameraModel
+    source: Literal["self-calibrated", "assumed"]
+    deviation: float | None
+    note: str
+
+    def write(self, file: Path, camera: CameraModel | None = None) -> None:
+        """camera.json; of another camera where the images were cut or resized."""
+        write_found_camera(camera or self.camera, file, self.source, self.deviation, self.note)
+
+
+def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = None) -> Found:
+    """The camera of the source's frames with how sure it is, or the one of its field of view where they do not
+    connect. Said in the run."""
+    width, height = size_of_frames(source.data, source.format)
+    with tempfile.TemporaryDirectory(prefix="stand-in-") as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the frames are opened again, under the camera that is found
+        stand_in = Path(folder) / "camera.json"
+        write_camera(across(width, height, source.fov or 70.0), stand_in)
+        frames = replace(source, camera=stand_in, fov=None).open().without_truth()
+        try:
+            found = _found(frames, source.fov, run, config)
+        except InputError as error:
+            if source.fov is None:
+                raise
+            note = f"assumed: a pinhole {source.fov:g} degrees across, as --fov says, not calibrated"
+            run.warn(f"the camera is {note}: {error.found}; lengths and shapes may be wrong")
+            return Found(across(width, height, source.fov), "assumed", None, note)
+    (run.log if found.told else run.warn)(str(found))
+    run.record["self_calibration"] = {
+        "focal_length_px": round(found.camera.focal_length, 3),
+        "deviation": round(found.deviation, 5),
+        "told_by_the_motion": found.told,
+        "frames": found.mapped,
+        "focal_lengths_from_starts_px": list(found.from_starts),
+    }
+    return Found(found.camera, "self-calibrated", found.deviation, str(found))
+
+
+def _found(frames: FrameSequence, fov: float | None, run: Run, config: SfmConfig | None) -> SelfCalibration:
+    """By the first stretch whose motion tells the focal length, else by the one that tells most."""
+    seen: list[SelfCalibration] = []
+    failed: InputError | None = None
+    tried: list[list[int]] = []
+    for place in _PLACES:
+        rows = stretch(len(frames), [frames[i].time for i in (0, min(1, len(frames) - 1))], place)
+        if rows in tried:
+            continue
+        tried.append(rows)
+        run.log(f"camera: {len(rows)} frames from {frames.names[rows[0]]} to {frames.names[rows[-1]]} are mapped")
+        try:
+            seen.append(self_calibrated(frames.at(rows), config, fov=fov))
+        except InputError as error:
+            failed = failed or error
+            continue
+        if seen[-1].told:
+            return seen[-1]
+    if not seen:
+        assert failed is not None
+        raise failed
+    return min(seen, key=lambda each: each.deviation)
+
+
+def stretch(count: int, times: Sequence[float | None], place: float) -> list[int]:
+    """Rows of up to `FRAMES` frames about a place of a sequence, a share of it, so far apart that the camera moves."""
+    first, second = times
+    step = 1 / 30 if first is None or second is None or second <= first else second - first
+    apart = int(np.clip(round(_SECONDS_APART / step), 1, max(1, count // FRAMES)))
+    taken = min(FRAMES, (count - 1) // apart + 1)
+    start = int(np.clip(round(place * count - apart * taken / 2), 0, count - 1 - apart * (taken - 1)))
+    return [start + apart * i for i in range(taken)]
