@@ -58,6 +58,8 @@ def write_surfaces(exported: Exportable, folder: Path) -> list[str]:
     scalars: dict[str, np.ndarray] = {}
     if dense.confidence is not None:
         scalars = {"confidence": dense.confidence, "quality": dense.confidence}
+    if dense.expected_error is not None:
+        scalars["expected_error"] = dense.expected_error
     if dense.views is not None:
         scalars["views"] = dense.views
     surface = (dense.vertices, dense.triangles, exported.normals)
