@@ -222,9 +222,12 @@ def unknown_distortion(path):
     edit_text(path / "camera.yaml", "distortion_model: plumb_bob", "distortion_model: division")
 
 
-@mistake("Calibrated with k3", "camera", "camera.yaml: distortion_coefficients: k3 = 0.3; expected 0", "CALIB_FIX_K3")
-def k3(path):
-    edit_text(path / "camera.yaml", "data: [ 0.0, 0.0, 0.0, 0.0, 0.0 ]", "data: [ 0.1, 0.0, 0.0, 0.0, 0.3 ]")
+@mistake(
+    "Calibrated a tilted sensor", "camera", "camera.yaml: distortion_coefficients: a tilted sensor", "CALIB_TILTED"
+)
+def tilted(path):
+    edit_text(path / "camera.yaml", "data: [ 0.0, 0.0, 0.0, 0.0, 0.0 ]", f"data: {[0.0] * 12 + [0.01, 0.0]}")
+    edit_text(path / "camera.yaml", "cols: 5", "cols: 14")
 
 
 @mistake(
