@@ -208,7 +208,7 @@ def write_origin(folder: Path, submap: Submap, scale: float) -> None:
     """origin.json: what is to be added to the coordinates of the other files for those of the map that was read, in
     their unit. Single precision, which meshes are written in, could not hold both."""
     added = [float(value * scale) for value in submap.origin]
-    (folder / "origin.json").write_text(json.dumps({"add_to_all_coordinates": added}) + "\n")
+    (folder / "origin.json").write_text(json.dumps({"add_to_all_coordinates": added}) + "\n", encoding="utf-8")
 
 
 def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.ndarray | None = None) -> None:

@@ -122,12 +122,15 @@ def test_a_map_that_is_too_poor_to_judge_lets_the_network_be_held_near_its_start
     assert "the map teaches nothing" in (tmp_path / "run" / "log.txt").read_text()
 
 
-@pytest.mark.parametrize(("value", "said"), [(0.0, "100% of the frames are black"), (1.0, "100% white")])
-def test_frames_that_show_nothing_are_refused(start, tmp_path, value, said):
+@pytest.mark.parametrize(
+    ("value", "said", "cure"),
+    [(0.0, "none of the 6 frames has a pixel", "are they black"), (1.0, "100% white", "lit tissue")],
+)
+def test_frames_that_show_nothing_are_refused(start, tmp_path, value, said, cure):
     frames = colon(count=6).frames
     empty = [replace(f, image=np.full_like(f.image, value), true_distance=None) for f in frames]
     write_folder(empty, tmp_path / "data")
-    with refused(found=said, cure="lit tissue"):
+    with refused(found=said, cure=cure):
         adapted(start, tmp_path / "data", tmp_path / "run")
 
 

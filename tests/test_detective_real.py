@@ -59,7 +59,7 @@ def test_each_wrong_frame_rate_is_refused_and_the_right_one_named(realdata, tmp_
     frames, and of most frames between keyframes there is no image."""
     verdict = investigate(stella_map(realdata / "stella", kind, fps, tmp_path), stella_frames(realdata / "stella"))
     assert verdict.judgement == "wrong", verdict.sentence
-    times = float(verdict.cure.split(" beside the map by ")[1].split(" ")[0])
+    times = float(verdict.cure.split(" beside the map, by ")[1].split(" ")[0])
     assert times == pytest.approx(30 / fps, rel=0.05)
 
 

@@ -34,7 +34,6 @@ def grey(camera=SMALL, value: float = 0.5, **more) -> Frame:
         ("Seq_001\\images\\out5.png", 5),
         ("3D_maps/2/keyframe-14", 14),
         ("clip2_frame_0040.v1", 40),
-        ("1625.33", 33),
         ("0000.png", 0),
     ],
 )

@@ -276,7 +276,7 @@ def test_nobody_gave_a_light_that_its_source_calls_assumed_whatever_its_numbers_
     write_light(PhotometricCalibration(gamma=1.0), tmp_path / "light.json")
     assert read_light(tmp_path / "light.json").assumed
     assert read_light("gamma=2.2,mu=2.767").source == "given"
-    frames = sequence([Frame("0", np.zeros((96, 120, 3), np.float32), CAMERA)])
+    frames = sequence([Frame("0", np.full((96, 120, 3), 0.5, np.float32), CAMERA)])
     write_folder(frames, tmp_path / "seq")
     assert open_sequence(tmp_path / "seq")[0].light.assumed
     assert not open_sequence(tmp_path / "seq", light=tmp_path / "seq" / "light.json")[0].light.assumed

@@ -88,7 +88,7 @@ PAGES = {
             "lightdepth adapt data/mine -o runs/mine --map runs/slam",
             "lightdepth adapt data/mine -o runs/mine --steps 600 --more data/others --what decoder",
         ),
-        rare=("rank", "anchor", "replay", "points", "overlap", "held_out", "keep_worse"),
+        rare=("rank", "anchor", "replay", "points", "overlap", "held_out", "keep_worse", "bit_depth", "fov"),
     ),
     "ablate": Page(
         (

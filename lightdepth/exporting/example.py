@@ -65,8 +65,8 @@ def run(model: Path, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
 
 
 def main(model: str, image_file: str, camera_file: str, out: str, mask_file: str | None = None) -> None:
-    settings = json.loads((Path(model).parent / "model.json").read_text())
-    camera = json.loads(Path(camera_file).read_text())
+    settings = json.loads((Path(model).parent / "model.json").read_text(encoding="utf-8"))
+    camera = json.loads(Path(camera_file).read_text(encoding="utf-8-sig"))
     image = np.asarray(Image.open(image_file).convert("RGB"), np.float64) / 255
     mask = np.ones(image.shape[:2], bool) if mask_file is None else np.asarray(Image.open(mask_file).convert("L")) > 127
     width, height = settings["size"] or (round(image.shape[1] * settings["rows"] / image.shape[0]), settings["rows"])
