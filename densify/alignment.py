@@ -33,8 +33,9 @@ class AlignmentConfig:
     ratio with the least median of squared residuals, median the median ratio. median is never refined (refine, loss),
     and serves to compare with."""
     t: float = 2.5
-    """Number of sigmas (sigma is the robust standard deviation of a keyframe's residuals) within which a map point is
-    an inlier, that is counts as right. More take in more points, wrong ones among them."""
+    """Number of sigmas (sigma is the robust standard deviation of what lies between a keyframe's map points and its
+    scaled depth) within which a map point counts as right, an inlier. A larger one takes in more points, wrong ones
+    among them."""
     finite_sample: bool = False
     """Whether sigma is widened by Rousseeuw's factor 1 + 5 / (n - 1), n the keyframe's number of points. Switched on,
     keyframes with few points keep more of them as inliers, wrong ones too; with many it makes no difference."""

@@ -33,9 +33,9 @@ class BendingConfig:
     """Number n of smooth bumps across and down the image that make up the bend, n x n of them, at least 2; several
     numbers lay several such grids over each other. More let depth bend in finer detail."""
     slope_deviation: float = 0.3
-    """Expected size (standard deviation) of the bend's slope, a ratio: change of the log of depth's factor per change
-    of the log of predicted distance; 0 switches the slope off. A larger one lets near wall be stretched against far
-    wall more freely."""
+    """How strongly the factor on distance is expected to change with distance itself (standard deviation, a ratio:
+    change of the factor's log per change of the log of predicted distance), besides over the image; a soft limit, 0
+    for no such change. A larger one lets near wall be stretched against far wall more freely."""
     bump_deviation: float = 0.1
     """Expected size (standard deviation) of each bump of the bend, in log distance (0.1 is 10 %), above 0. A larger one
     lets depth bend more strongly."""

@@ -33,8 +33,8 @@ class ContradictionConfig:
     """Difference, in log distance (0.05 is 5 %), up to which two keyframes agree on a pixel; only beyond it can one
     contradict the other. A larger one leaves out fewer pixels."""
     judges: int = 8
-    """Number of other keyframes that each is compared with, evenly chosen among those that share map points with it.
-    More have more pixels compared and take longer."""
+    """Number of other keyframes that each keyframe is compared with, chosen evenly in time among those that share map
+    points with it. More let more of its pixels be compared, so more may be removed, and take longer."""
     samples: int = 80
     """Number of pixels across the image that are compared, and in proportion down; each speaks for the cell around it.
     More tell the edges of what is left out more finely and take longer."""

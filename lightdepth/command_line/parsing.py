@@ -36,7 +36,8 @@ _GENERAL = {
     "help": "Show the everyday options, with examples, and exit.",
     "config": "YAML file with any of these options; those on the command line win.",
     "print_shtab": "Print a script for the shell that completes the names of options, and exit.",
-    "print_config": "Print all settings as YAML and exit: the beginning of a --config file.",
+    "print_config": "Print all settings, those given before it among them, as YAML that --config reads, and exit. "
+    "`=skip_null` leaves out those that are not set.",
 }
 _LAST = ("overwrite", "config", "print_config", "print_shtab", "help")
 _GROUP = "YAML file with any of the options of this group."

@@ -35,8 +35,9 @@ def predict(
         checkpoint: Depth model: a path (.safetensors or .ckpt) or a bundled name (lightdepth-synthetic or
             lightdepth-self); decline, distance by formula from brightness alone; constant, the same distance
             everywhere, to compare with.
-        refine: Number of steps in which the distance of each image is changed so that the light which it would give
-            comes closer to that which is seen; 0 for none. More follow the light further and take longer.
+        refine: Number of steps in which the predicted distance of each image is changed so that its wall, lit from that
+            far, looks more like the image; 0 for none, 100 is usual. More fit the image closer, which is not always
+            nearer to the truth, and take longer.
         uncertainty: Run folder of `densify` on the same endoscope with the same checkpoint, or its uncertainty.json;
             the predicted uncertainty is multiplied by the factor that hidden blocks of that map say. A larger factor
             makes wider intervals. Left out, uncertainty is written as predicted.

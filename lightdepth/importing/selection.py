@@ -35,8 +35,8 @@ class Choice:
     """Share, in [0, 1), of the sharpness of the sharper frames within about a second before and after, below which a
     frame is left out as blurred; 0 keeps all. A larger one leaves out more."""
     max_frames: int | None = None
-    """Largest number of frames to keep; where the other options leave more, so many of them are taken evenly. More keep
-    more frames; left out, there is no limit."""
+    """Largest number of frames to keep; where the other options keep more, this number of those is taken, evenly. A
+    larger one keeps more frames; without it there is no limit."""
 
     def __post_init__(self) -> None:
         if self.end is not None and self.end <= self.start:

@@ -45,7 +45,7 @@ class SensorConfig:
     makes brighter images."""
     shoulder: tuple[float, float] = (0.75, 1.0)
     """Ends of the range of the code value (brightness as stored), in [0, 1], from which the tone curve flattens towards
-    white. A higher one flattens less of it; 1 none."""
+    white, drawn for each colon. A larger one flattens less of the curve; (1, 1) none of it."""
     noise: tuple[float, float] = (0.003, 0.012)
     """Ends of the range of the standard deviation of the noise that does not depend on the light, in code values
     (brightness as stored, in [0, 1]). A larger one makes noisier images."""
