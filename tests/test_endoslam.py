@@ -12,7 +12,6 @@ from colons import CAMERA, colon
 from raising import refused
 
 from lightdepth.datasets import open_sequence, write_endoslam
-from lightdepth.errors import InputError
 
 
 @pytest.fixture(params=["UnityCam", "simulated"])
@@ -93,9 +92,9 @@ def test_poses_whose_columns_nobody_named_are_refused_with_what_to_do(rendered):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("a,b,c,d,e,f,g,h", r"line 3 is 'a[,;]b.*expected numbers"),
-        ("1,2,3,0,0,0,0,0", "line 3: a quaternion of length 0"),
-        ("nan,2,3,0,0,0,1,0", "line 3: .*NaN"),
+        ("a,b,c,d,e,f,g,h", "line 3 … expected numbers"),
+        ("1,2,3,0,0,0,0,0", "line 3 … a quaternion of length 0"),
+        ("nan,2,3,0,0,0,1,0", "line 3 … NaN"),
     ],
 )
 def test_poses_that_are_none_are_refused_by_line(rendered, line, message):
@@ -103,7 +102,7 @@ def test_poses_that_are_none_are_refused_by_line(rendered, line, message):
     lines = file.read_text().splitlines()
     lines[2] = line.replace(",", ";" if ";" in lines[0] else ",")
     file.write_text("\n".join(lines) + "\n")
-    with pytest.raises(InputError, match=message):
+    with refused(message):
         open_sequence(rendered)
 
 
