@@ -107,6 +107,8 @@ def test_a_real_c3vd_trajectory_is_read_the_same_from_either_order(realdata, tmp
     poses[:, :3, :3] = poses[:, :3, :3] @ np.diag([1.0, -1, -1])
     poses[:, :3, 3] = poses[:, :3, 3] / found["scene_scale"] - np.array(found["scene_T"])[:3, 3]
     image = np.full((80, 100, 3), 99, np.uint8)
+    for rows in (slice(None, 12), slice(-12, None)):
+        image[rows, :12] = image[rows, -12:] = 0  # the octagon's corners: without them it looks undistorted
     read = {}
     for order in ("row by row", "column by column"):
         folder = tmp_path / order
