@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -283,3 +284,13 @@ def test_what_cannot_be_exported_is_refused_with_what_could(place, tmp_path, cap
     with pytest.raises(ValueError, match="not a map of COLMAP's"):
         read_array(tmp_path / "x.bin")
     assert read_dense_map(place / "run" / "map_000").id == 0
+
+
+def test_what_was_taken_off_a_far_map_stands_beside_what_is_made_of_it(place, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(place / "run", run)
+    (run / "map_000" / "origin.json").write_text('{"add_to_all_coordinates": [460000.0, 5400000.0, 160.0]}\n')
+    assert main(["export", str(run), "-o", str(tmp_path / "out"), "--to", "glb"]) == 0
+    kept = json.loads((tmp_path / "out" / "map_000" / "origin.json").read_text())
+    assert kept == {"add_to_all_coordinates": [460000.0, 5400000.0, 160.0]}
+    assert "far from its origin" in (tmp_path / "out" / "log.txt").read_text()

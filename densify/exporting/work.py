@@ -69,7 +69,16 @@ def export_maps(run: Run, source: Path, to: str, options: MapExport) -> None:
             write_mesh(exported, folder / f"mesh.{to}")
         for words in said:
             run.warn(f"{exported.name}: {words}")
+        _keep_origin(run, source, exported.name)
         run.log(f"{exported.name}: {len(exported.submap.keyframes)} keyframes, {len(exported.dense.vertices)} vertices")
+
+
+def _keep_origin(run: Run, source: Path, name: str) -> None:
+    """origin.json of a map that lies far from its origin, beside what was made of it, whose coordinates are near."""
+    for file in (folder / "origin.json" for folder in map_folders(source) if folder.name == name):
+        if file.is_file():
+            (run.folder / name / file.name).write_bytes(file.read_bytes())
+            run.log(f"{name}: the map lies far from its origin; {file.name} has what is to be added")
 
 
 def _frames(run: Run, source: Path, given: Path | None) -> FrameSequence | None:
