@@ -88,6 +88,15 @@ def test_what_is_there_is_replaced_only_when_asked_and_only_when_we_made_it(tmp_
     assert [p.name for p in (tmp_path / "photos").iterdir()] == ["mine.txt"]
 
 
+def test_a_run_does_not_replace_what_it_reads(tmp_path):
+    make(tmp_path / "out", "old")
+    for what in (str(tmp_path / "out"), tmp_path / "out" / "result.txt"):
+        given = {"what": what, "output": tmp_path / "out"}
+        with refused(where="out", cure="choose another -o"), run_folder(tmp_path / "out", "export", given, True):
+            pass
+    assert (tmp_path / "out" / "result.txt").read_text() == "old"
+
+
 def test_an_empty_folder_is_filled_and_a_file_is_no_folder(tmp_path):
     (tmp_path / "out").mkdir()
     make(tmp_path / "out")

@@ -9,8 +9,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.camera_conversion import convert_camera
-from lightdepth.errors import InputError
-from lightdepth.files.images import to_bgr8
+from lightdepth.files import images
 
 
 def known_camera(camera: CameraModel, names: tuple[str, ...], instead: str) -> tuple[CameraModel, str]:
@@ -47,5 +46,4 @@ def seen_by(image: np.ndarray, camera: CameraModel, other: CameraModel) -> np.nd
 def write_image(path: Path, image: np.ndarray) -> None:
     """(H, W, 3) RGB in [0, 1] as an 8-bit PNG."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), to_bgr8(image)):
-        raise InputError(path, "cannot be written", "choose another place")
+    images.write_image(path, images.to_bgr8(image))

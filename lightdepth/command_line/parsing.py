@@ -333,7 +333,7 @@ def _check_config(parser: Parser, file: Path) -> None:
     """Ends the program where a file is no YAML of settings, or has a value in the place of a group of them."""
     more = f"Read on: {parser.prog} --help"
     if not _is_yaml(file):
-        fail(parser, f"{file}: not YAML: expected a line `option: value` for each setting. {more}")
+        fail(parser, f"{file}: not YAML: expected a line `option: value` for each setting, in UTF-8. {more}")
     found = read_settings(file)
     if not isinstance(found, Mapping):
         fail(parser, f"{file}: no settings in it; expected a line `option: value` for each. {more}")

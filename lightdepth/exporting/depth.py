@@ -9,10 +9,10 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from lightdepth.errors import InputError
+from lightdepth.files.images import write_image
 from lightdepth.geometry import depth_from_distance
 from lightdepth.prediction import DepthPrediction
 
@@ -34,8 +34,7 @@ def write_png16(path: Path, depth: np.ndarray, step: float) -> None:
             path, f"depth {depth.max():.4g} is more than {CODES} steps of {step:g}", "give a larger --step"
         )
     codes = np.where(depth > 0, np.maximum(codes, 1), 0)  # what is known is never 0
-    if not cv2.imwrite(str(path), codes.astype(np.uint16)):
-        raise InputError(path, "cannot be written", "choose another place")
+    write_image(path, codes.astype(np.uint16))
 
 
 def write_exr(path: Path, values: np.ndarray, channel: str = "Z") -> None:

@@ -126,6 +126,10 @@ def run_folder(output: Path, verb: str, arguments: Mapping[str, Any], overwrite:
                 "not overwritten, it has no run.json and so was not made by this program",
                 "choose another -o, or remove it yourself",
             )
+        for name, value in arguments.items():
+            read = Path(value).resolve() if name != "output" and isinstance(value, str | Path) and value else None
+            if read is not None and read.is_relative_to(output.resolve()) and read.exists():
+                raise InputError(output, f"not overwritten, {value} is read from it", "choose another -o")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         # Beside the target, so that the finished folder arrives by a rename; a name of its own: nothing is in its way.
