@@ -41,7 +41,6 @@ class Judge:
         self._images = Images(config.judge.parallax)
         self._fold = submap_folds(submap, config.judge.folds, config.judge.seed)
         self._ratios: dict[str, np.ndarray] = {}
-        self._blocks: dict[str, np.ndarray] = {}
         self._sigma: dict[str, np.ndarray] = {}
         self._told: dict[str, Seen] = {}
         self._kept: dict[str, Kept] = {}
@@ -63,14 +62,13 @@ class Judge:
 
     def _ask(self, keyframes: Sequence[AlignedKeyframe]) -> None:
         """Hides blocks of wall, and measures between the images; once."""
-        if self._blocks or not self._config.judge.on:
+        if self._ratios or not self._config.judge.on:
             return
         self._told = self._images.measure(self._submap)
         for k in keyframes:
             if k.view is not None and len(k.view.observed):
                 fold = self._fold[self._submap.rows_of(k.view.observed.point_ids)[0]]
-                self._ratios[k.keyframe.name] = ratios = hidden_ratios(k.view, fold, self._method)
-                self._blocks[k.keyframe.name] = np.abs(ratios - 1)
+                self._ratios[k.keyframe.name] = hidden_ratios(k.view, fold, self._method)
 
     def judgement(self, dense: DenseMap, keyframes: Sequence[AlignedKeyframe]) -> Judgement | None:
         """What is known of the surface; None where the judge is switched off."""
@@ -84,26 +82,27 @@ class Judge:
                 continue
             fold = -rng.integers(0, self._config.judge.folds, len(k.view.observed))
             drawn.append(hidden_errors(k.view, fold, self._method))
-            if k.keyframe.name in self._blocks:
-                delivered.append(self._blocks[k.keyframe.name][:, 1 if k.alignment.bend else 0])
+            if k.keyframe.name in self._ratios:
+                delivered.append(np.abs(np.exp(self._log_delivered(k)) - 1))
             told = self._told.get(k.keyframe.name)
             if told is not None and len(told.judging) and len(k.view.observed) >= self._config.alignment.min_points:
                 images.append(FourWays.of(k.view, self._method).errors(told.judging))
         points = [(k.keyframe, self._told[k.keyframe.name].judging) for k in keyframes if k.keyframe.name in self._told]
         sizes = [_size(k.alignment.bend) for k in keyframes if k.alignment.bend]
+        blocks = [np.abs(ratios - 1) for ratios in self._ratios.values()]
         return Judgement(
-            Columns.of(list(self._blocks.values())),
-            Columns.of(drawn),
-            Columns.of(images),
-            Withheld.of_errors(np.concatenate([np.zeros(0), *delivered])),
-            Withheld.of_errors(np.concatenate([np.zeros(0), *(errors[:, 3] for errors in self._blocks.values())])),
-            Withheld.of(dense, points),
-            len(keyframes),
-            sum(k.alignment.ok for k in keyframes),
-            sum(kept.share == 0 for kept in self._kept.values()),
-            sum(0 < kept.share < 1 for kept in self._kept.values()),
-            float(np.median(sizes)) if sizes else 0.0,
-            self._doubts(keyframes),
+            blocks=Columns.of(blocks),
+            drawn=Columns.of(drawn),
+            images=Columns.of(images),
+            hidden=Withheld.of_errors(np.concatenate([np.zeros(0), *delivered])),
+            hidden_constant=Withheld.of_errors(np.concatenate([np.zeros(0), *(errors[:, 3] for errors in blocks)])),
+            surface=Withheld.of(dense, points),
+            keyframes=len(keyframes),
+            aligned=sum(k.alignment.ok for k in keyframes),
+            undone=sum(kept.share == 0 for kept in self._kept.values()),
+            lessened=sum(0 < kept.share < 1 for kept in self._kept.values()),
+            bends=float(np.median(sizes)) if sizes else 0.0,
+            doubts=self._doubts(keyframes),
         )
 
     def _doubts(self, keyframes: Sequence[AlignedKeyframe]) -> Doubts | None:
@@ -120,18 +119,21 @@ class Judge:
             use = np.isfinite(told[0][:, 0]) & (told[1] > 0)
             ratio, sigma, spread = (each[use] for each in told)
             where = fold[use], view.observed.pixels[use] / k.keyframe.camera.width
-            one, bend = np.log(ratio[:, :2]).T
-            for error, into in ((one, predicted), (one + self._share(k) * (bend - one), delivered)):
+            for error, into in ((np.log(ratio[:, 0]), predicted), (self._log_delivered(k)[use], delivered)):
                 into.append(HiddenErrors(error, sigma, spread, *where))
         # A map whose points err together would be called the model's error.
         undone, aligned = sum(kept.share == 0 for kept in self._kept.values()), sum(k.alignment.ok for k in keyframes)
         against = f"{undone} of {aligned} bends to the map's points had to be undone" if 2 * undone > aligned else ""
         return Doubts(tuple(predicted), tuple(delivered), against) if predicted else None
 
-    def _share(self, k: AlignedKeyframe) -> float:
-        """Share of its bend that a keyframe was delivered with."""
+    def _log_delivered(self, k: AlignedKeyframe) -> np.ndarray:
+        """Errors (n,) in log distance at hidden points, with the share of its bend that a keyframe was delivered
+        with."""
         kept = self._kept.get(k.keyframe.name)
-        return 0.0 if k.alignment.bend is None else 1.0 if kept is None else kept.share
+        share = 0.0 if k.alignment.bend is None else 1.0 if kept is None else kept.share
+        one, bend = np.log(self._ratios[k.keyframe.name][:, :2]).T
+        result: np.ndarray = one + share * (bend - one)
+        return result
 
     def _tried(self, k: AlignedKeyframe) -> Tried:
         bend, alone, told = k.alignment.bend, k.alone, self._told.get(k.keyframe.name)
@@ -142,7 +144,7 @@ class Judge:
             level = np.log(alone.scale)
             field = level + np.outer(bend.at(o.pixels, o.predicted) - level, SHARES)
             by_images = field + np.log(o.predicted / o.mapped)[:, None]
-        blocks = self._blocks.get(k.keyframe.name, np.zeros((0, 4)))
+        blocks = np.abs(self._ratios.get(k.keyframe.name, np.zeros((0, 4))) - 1)
         return Tried(by_images, blocks[:, :2], _size(bend))
 
     def _lessened(self, k: AlignedKeyframe) -> AlignedKeyframe:

@@ -33,8 +33,8 @@ _LARGEST = 2.0
 
 @dataclass(frozen=True)
 class Tried:
-    """One keyframe's bend: errors in log distance (n, 3) with each of SHARES by the images and (m, 2) with none and all
-    of it at hidden blocks, and the size of the bend in deviations of its prior (1 is usual)."""
+    """One keyframe's bend: errors in log distance (n, 3) with each of SHARES by the images, errors as shares (m, 2)
+    with none and all of it at hidden blocks, and the size of the bend in deviations of its prior (1 is usual)."""
 
     by_images: np.ndarray
     by_map: np.ndarray
