@@ -10,8 +10,8 @@ speaks only where the best score is high, no other hypothesis comes near it, and
 texture, or without parallax, it does not.
 
 The guess is the map's: the median distance of the points that the keyframe observed nearby. So what is judged has no
-part in where is looked. It decides how a patch is slanted too; not what is found. The poses are taken as they are: one
-factor on all of them, or a slow drift of it, cannot be seen.
+part in where is looked. It decides how a patch is slanted too; not what is found. Poses that contradict the images are
+mended before (lightdepth.relative_pose); one factor on all of them, or a slow drift of it, cannot be seen.
 """
 
 from __future__ import annotations
@@ -61,6 +61,9 @@ class ParallaxConfig:
     least_score: float = 0.7
     """Least correlation, at most 1, of a patch with what the other keyframes show of it, for its distance to count. A
     larger one gives fewer, surer distances."""
+    off_line: float = 1.0
+    """Distance of what two keyframes both show from its epipolar line, the median in pixels, above which the images
+    tell how the two stood to each other, in place of the map's poses. A larger one trusts the map's poses more."""
 
 
 @dataclass(frozen=True, repr=False)

@@ -14,6 +14,7 @@ from lightdepth.frame import Frame
 from lightdepth.observations import ObservedDistances
 from lightdepth.parallax import Look, ParallaxConfig, guessed, measured, parallax_neighbours
 from lightdepth.prediction import DepthPrediction, shrunk
+from lightdepth.relative_pose import as_the_images_say
 from lightdepth.sparse_map import Keyframe, Submap
 
 _FIELDS = (6, 5)  # across and down
@@ -49,9 +50,10 @@ class Images:
             if keyframe.name not in self._seen:
                 continue
             look, prediction = self._seen[keyframe.name]
+            guess = guessed(look.keyframe, submap)
             others = [self._seen[names[j]][0] for j in beside if names[j] in self._seen]
-            told = measured(look, others, guessed(look.keyframe, submap), prediction, self._config)
-            found[keyframe.name] = _halves(told, keyframe)
+            others = [as_the_images_say(look, other, guess, self._config) for other in others]
+            found[keyframe.name] = _halves(measured(look, others, guess, prediction, self._config), keyframe)
         return found
 
 
