@@ -127,18 +127,29 @@ def _inside(pixels: np.ndarray, look: Look, margin: float) -> np.ndarray:
 
 def _there_and_back(look: Look, other: Look, pixels: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (n, 2) in the other image, and which of them lead back to where they came from (n,)."""
-    here, there = _even(look), _even(other)
-    settings = {
-        "winSize": (13, 13),
-        "maxLevel": 2,
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
-    }
+    images = _even(look), _even(other)
     start, guess = ((p - 0.5).astype(np.float32)[:, None] for p in (pixels, expected))
-    found, forth, _ = cv2.calcOpticalFlowPyrLK(here, there, start, guess.copy(), **settings)
-    again, back, _ = cv2.calcOpticalFlowPyrLK(there, here, found, start.copy(), **settings)
-    kept = (forth[:, 0] > 0) & (back[:, 0] > 0) & (np.linalg.norm((again - start)[:, 0], axis=1) < _THERE_AND_BACK)
+    found, forth = _followed(*images, start, guess)
+    again, back = _followed(*images[::-1], found, start)
+    kept = forth & back & (np.linalg.norm(again - start, axis=2)[:, 0] < _THERE_AND_BACK)
     return found[:, 0].astype(float) + 0.5, kept
+
+
+def _followed(
+    here: np.ndarray, there: np.ndarray, start: np.ndarray, guess: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (n, 1, 2) in another image, OpenCV's pixels, from where they are guessed, and which were found (n,)."""
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        here,
+        there,
+        start,
+        guess.copy(),
+        winSize=(13, 13),
+        maxLevel=2,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return np.asarray(found), np.asarray(status)[:, 0] > 0
 
 
 def _even(look: Look) -> np.ndarray:
