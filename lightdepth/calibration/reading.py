@@ -33,9 +33,9 @@ from lightdepth.files.text import read_text, rows
 from lightdepth.photometry import PhotometricCalibration
 
 CAMERA_FORMATS = (
-    "camera.json, vicalib XML (EndoMapper), OpenCV, ROS, Kalibr, ORB-SLAM or stella_vslam YAML, COLMAP cameras.txt or "
-    "cameras.bin, nerfstudio's transforms.json, ocamcalib calib_results.txt, MATLAB .mat, or intrinsics.txt (3x3 or "
-    "4x4 numbers)"
+    "camera.json, vicalib XML (EndoMapper), OpenCV's YAML or XML, ROS, Kalibr, ORB-SLAM or stella_vslam YAML, COLMAP "
+    "cameras.txt or cameras.bin, nerfstudio's transforms.json, ocamcalib calib_results.txt, MATLAB .mat, or "
+    "intrinsics.txt (3x3 or 4x4 numbers)"
 )
 
 
@@ -73,9 +73,10 @@ def _read(path: Path, size: tuple[int, int] | None) -> CameraModel:
     start = text.lstrip("\ufeff \t\r\n")
     if start.startswith("{"):
         return _read_json(path, size)
-    if start.startswith("<"):
+    stored = re.search(r"<opencv_storage\b", start[:2000]) is not None
+    if start.startswith("<") and not stored:
         return _plausible(read_vicalib(path), path)
-    if start.startswith("%YAML") or path.suffix.lower() in (".yaml", ".yml"):
+    if stored or start.startswith("%YAML") or path.suffix.lower() in (".yaml", ".yml"):
         return _plausible(read_opencv(path, size), path)
     lines = rows(text)
     if lines and len(lines[0]) > 2 and re.fullmatch(r"[A-Z][A-Z0-9_]+", lines[0][1]):
