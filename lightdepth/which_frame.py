@@ -111,6 +111,13 @@ class Stamps:
         return numbers[order], times[order]
 
     @property
+    def numbered_by_time(self) -> bool:
+        """Whether the frames' numbers are their times, in a unit that names have, and count nothing."""
+        numbers, times = self.known
+        units = (_MICROSECOND, *_UNITS.values())
+        return bool(times.any()) and any(np.abs(numbers * unit - times).max() < _MICROSECOND for unit in units)
+
+    @property
     def step(self) -> float:
         """Usual time from a frame to the next [s]."""
         return float(np.median(np.diff(self.known[1])))
@@ -185,9 +192,8 @@ class Clock:
         """Whether stamps say more than a rate: where there is none, where the frames' numbers are times themselves and
         count nothing, and where both are of one clock of no video, such as Unix time."""
         assert self.frames is not None
-        numbers, stamps = self.frames.known
-        same_clock = stamps[0] > _FOREIGN and times.min() > _FOREIGN and self.time_offset is None
-        return bool(self.fps is None or same_clock or _are_times(numbers, stamps))
+        same_clock = self.frames.known[1][0] > _FOREIGN and times.min() > _FOREIGN and self.time_offset is None
+        return bool(self.fps is None or same_clock or self.frames.numbered_by_time)
 
     def _counted(self, counted: np.ndarray, times: np.ndarray, where: Path | str) -> list[str]:
         numbers = np.rint(counted)
@@ -232,13 +238,6 @@ class Clock:
             stacklevel=2,
         )
         return stamp - first
-
-
-def _are_times(numbers: np.ndarray, times: np.ndarray) -> bool:
-    """Whether frames are numbered by their times [s], in a unit that names have."""
-    return bool(times.any()) and any(
-        np.abs(numbers * unit - times).max() < _MICROSECOND for unit in (_MICROSECOND, *_UNITS.values())
-    )
 
 
 def _unique(names: list[str], where: Path | str) -> list[str]:

@@ -152,8 +152,14 @@ def test_frames_named_by_their_times_meet_a_map_of_their_names_and_one_of_times(
     (tmp_path / "model" / "images.txt").write_text(text)
     assert met(timed, tmp_path / "model", "--map-rules.between", 1) == {n: r for n, r in right.items()}
     as_installed(submap, tmp_path / "out")
-    of_map = met(timed, tmp_path / "out", "--map-rules.between", 1)  # its own fps counts nothing in such names
-    assert {n: r[1] for n, r in of_map.items()} == {n: r[1] for n, r in right.items()}
+    for older in (False, True):  # neither its own fps nor src_frm_id counts anything in such names
+        if older:
+            content = msgpack.unpackb((tmp_path / "out" / "map.msg").read_bytes())
+            for number, entry in enumerate(content["keyframes"].values()):
+                entry["src_frm_id"] = number
+            (tmp_path / "out" / "map.msg").write_bytes(msgpack.packb(content))
+        of_map = met(timed, tmp_path / "out", "--map-rules.between", 1)
+        assert {n: r[1] for n, r in of_map.items()} == {n: r[1] for n, r in right.items()}
     (tmp_path / "out" / "map.msg").unlink()
     shutil.copy(tmp_path / "model" / "points3D.txt", tmp_path / "out")
     found = met(timed, tmp_path / "out", "--map-rules.between", 1)

@@ -173,15 +173,21 @@ def _keyframe(entry: Mapping[Any, Any], where: str, frame: str, cameras: _Camera
 
 def _names(entries: Mapping[str, Mapping[Any, Any]], cameras: _Cameras, path: Path, begun: Begun) -> list[str]:
     """Each keyframe's frame: by src_frm_id, which stella_vslam no longer writes, else by its time."""
-    if all("src_frm_id" in entry for entry in entries.values()):
+    if _counted(entries, cameras.convention.clock):
         return [f"{_integer(e['src_frm_id'], f'{where}.src_frm_id'):06d}.png" for where, e in entries.items()]
     times = np.array([_time(entry, where) for where, entry in entries.items()])
     return cameras.clock(entries).names(times, path, begun)
 
 
+def _counted(entries: Mapping[str, Mapping[Any, Any]], clock: Clock) -> bool:
+    """Whether keyframes meet frames by src_frm_id, a count from 0: not where frames are numbered by their times."""
+    by_time = clock.frames is not None and clock.frames.numbered_by_time
+    return not by_time and all("src_frm_id" in entry for entry in entries.values())
+
+
 def _guesses(entries: Mapping[str, Mapping[Any, Any]], clock: Clock) -> bool:
     """Whether the keyframes' times are of a clock whose beginning had to be guessed."""
-    if all("src_frm_id" in entry for entry in entries.values()):
+    if _counted(entries, clock):
         return False
     return clock.guesses(np.array([_time(entry, where) for where, entry in entries.items()]))
 
