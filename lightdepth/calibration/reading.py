@@ -71,12 +71,12 @@ def _read(path: Path, size: tuple[int, int] | None) -> CameraModel:
         return _read_json(path, size)
     text = read_text(path, f"expected {CAMERA_FORMATS}")
     start = text.lstrip("\ufeff \t\r\n")
-    if start.startswith("{"):
+    if start.startswith("{") and suffix not in (".yaml", ".yml"):  # flow style is YAML, too
         return _read_json(path, size)
     stored = re.search(r"<opencv_storage\b", start[:2000]) is not None
     if start.startswith("<") and not stored:
         return _plausible(read_vicalib(path), path)
-    if stored or start.startswith("%YAML") or path.suffix.lower() in (".yaml", ".yml"):
+    if stored or start.startswith("%YAML") or suffix in (".yaml", ".yml"):
         return _plausible(read_opencv(path, size), path)
     lines = rows(text)
     if lines and len(lines[0]) > 2 and re.fullmatch(r"[A-Z][A-Z0-9_]+", lines[0][1]):
