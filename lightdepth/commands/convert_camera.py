@@ -35,7 +35,7 @@ def convert_camera(
             x 4 matrix; left out, the one that the output's name tells.
         mask: Image, white where tissue shows: with --model, only these pixels count in the fit; left out, all do.
         most_px: With --model, the most that the fit may be off anywhere in the image, pixels: a worse one is refused.
-            Left out, half a percent of the image's longer side; more lets a worse fit through.
+            Left out, half a percent of the image's longer side. A larger one lets a worse fit through.
         overwrite: Replace a file made before.
     """
     if output.exists() and not overwrite:
