@@ -332,7 +332,7 @@ def _on_line(argv: Sequence[str], key: str) -> bool:
 def _config_files(argv: Sequence[str]) -> Iterator[Path]:
     for word, following in pairwise([*argv, ""]):
         path = following if word == "--config" else word.removeprefix("--config=") if word[:9] == "--config=" else ""
-        if path and Path(path).is_file():
+        if path and "\n" not in path and Path(path).is_file():  # settings may stand there themselves (gone_settings)
             yield Path(path)
 
 
