@@ -119,6 +119,7 @@ def test_the_verb_gives_a_file_its_size_and_refuses_another_aspect(tmp_path, cap
     assert read_camera(tmp_path / "camera.json") == SMALL["PINHOLE"]
     argv = ["convert-camera", str(tmp_path / "camera.json"), "-o", str(tmp_path / "small.yaml"), "--size"]
     assert main([*argv, "[48, 48]"]) == 3 and "is for 96x80; expected the same aspect" in capsys.readouterr().err
+    assert main([*argv, "[0, 0]"]) == 3 and "--size: [0, 0]; expected a width" in capsys.readouterr().err
     assert main([*argv, "[48, 40]"]) == 0
     assert read_camera(tmp_path / "small.yaml").params == pytest.approx(SMALL["PINHOLE"].resized(48, 40).params)
 
@@ -138,6 +139,7 @@ def test_the_verb_refuses_a_fit_that_is_far_off_with_its_residual(tmp_path, caps
     said = " ".join(capsys.readouterr().err.split())
     assert "the nearest PINHOLE is off by" in said and "(largest); expected 0.48 at most" in said
     assert not (tmp_path / "out.json").exists()
+    assert main([*argv, "--most-px", "-1"]) == 3 and "positive number of pixels" in capsys.readouterr().err
     assert main([*argv, "--most-px", "100"]) == 0 and (tmp_path / "out.json").exists()
 
 

@@ -40,6 +40,10 @@ def convert_camera(
     """
     if output.exists() and not overwrite:
         raise InputError(output, "already there", "choose another -o, or give --overwrite")
+    if size is not None and min(size) < 1:
+        raise InputError("--size", f"{list(size)}", "expected a width and a height of some pixels")
+    if most_px is not None and not most_px > 0:
+        raise InputError("--most-px", f"{most_px:g}", "expected a positive number of pixels")
     camera = read_camera(file, size)
     if size is not None and size != (camera.width, camera.height):
         if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > 0.01:
