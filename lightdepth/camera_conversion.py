@@ -14,6 +14,10 @@ import numpy as np
 from lightdepth.camera import CAMERA_MODELS, Brown, CameraModel, FullBrown, KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.errors import InputError
 
+LARGEST_ERROR_SHARE = 0.005
+"""A camera stands in for another where no pixel is farther off than this part of the image's longer side: 7 pixels of
+an endoscope's 1350 (its Scaramuzza lens as a fisheye is 2 to 3 off)."""
+
 _FITTED = 5000  # pixels, of all that count
 _PLANE_LIMIT = np.cos(np.radians(75))  # beyond this angle x/z runs away, and would be all that is fitted
 
@@ -33,6 +37,20 @@ class Conversion:
     median_px: float
     max_px: float
     seen_share: float
+
+    def close_enough(self, where: str, most_px: float | None = None) -> Conversion:
+        """Itself, or InputError where it is more than `most_px` off somewhere; None is `LARGEST_ERROR_SHARE`."""
+        side = max(self.camera.width, self.camera.height)
+        most = LARGEST_ERROR_SHARE * side if most_px is None else most_px
+        if self.max_px > most:
+            off = f"{self.median_px:.2g} pixels (median), {self.max_px:.2g} (largest)"
+            raise InputError(
+                where,
+                f"the nearest {self.camera.name} is off by {off}",
+                f"expected {most:.2g} at most: choose another lens model, a mask of what counts, or a larger --most-px "
+                "of convert-camera",
+            )
+        return self
 
 
 def convert_camera(

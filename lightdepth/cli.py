@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 from lightdepth import __version__
 from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.command_line.pipes import outliving_readers
+from lightdepth.command_line.warned import warnings_as_sentences
 from lightdepth.errors import InputError, PartialFailure
 
 GROUP = "lightdepth.commands"
@@ -53,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show ends no run
-    with outliving_readers():
+    with outliving_readers(), warnings_as_sentences():
         return _main(sys.argv[1:] if argv is None else argv)
 
 

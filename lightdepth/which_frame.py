@@ -22,9 +22,14 @@ MAX_FRAME = 10**8
 _FOREIGN = 1e7  # seconds, from which times count from no video's beginning
 _SUFFIX = re.compile(r"\.[A-Za-z]\w*$")
 # A decimal number is a time where a unit says so, where it is all of the name or follows a separator, or where it
-# counts from 1970; `shot1.0001` is a counter behind a point.
+# counts from 1970; `shot1.0001` and `shot_01.0001` are counters behind a point, `frame_0.0333` is none.
 _SECONDS = re.compile(r"(\d+\.\d+)_?(?:s|sec)$", re.IGNORECASE)
 _TIME = re.compile(r"(?:^|[_\-= ]|(?:^|[^a-z])t)(\d+\.\d+)$", re.IGNORECASE)
+_OF_A_FRAME = re.compile(
+    r"(?:^|[^a-z])(?:f|(?:key)?frames?|frm|kf|im|img|images?|pics?|t|ts|times?|(?:time)?stamps?|sec|seconds?)[_\-= ]*$",
+    re.IGNORECASE,
+)
+_MICROSECOND = 1e-6
 _UNITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}  # digits of a time since 1970, and what one of it is in seconds
 
 
@@ -47,7 +52,7 @@ class WhichFrame:
         stem = _SUFFIX.sub("", last)
         time = _time_in(stem)
         if time is not None:
-            return cls(name, round(1e6 * time), time, folder)
+            return cls(name, round(time / _MICROSECOND), time, folder)
         digits = re.findall(r"\d+", stem)
         if not digits:
             raise InputError(
@@ -66,8 +71,9 @@ def _time_in(stem: str) -> float | None:
     if found is None:
         return None
     whole, _, part = found[1].partition(".")
-    counter = len(part) in (4, 5) and part[0] == "0" and found.start(1) > 0 and len(whole) < 9  # shot_01.0001
-    return None if counter else float(found[1])
+    padded = part[0] == "0" or (whole[0] == "0" and len(whole) > 1)  # shot_01.0001, shot_01.1000
+    counter = len(part) in (4, 5) and padded and found.start(1) > 0 and len(whole) < 9
+    return None if counter and not _OF_A_FRAME.search(stem[: found.start(1)]) else float(found[1])
 
 
 def frame_number(name: str) -> int:
@@ -103,6 +109,13 @@ class Stamps:
             return np.zeros(0, int), np.zeros(0)
         order = np.argsort(times, kind="stable")
         return numbers[order], times[order]
+
+    @property
+    def numbered_by_time(self) -> bool:
+        """Whether the frames' numbers are their times, in a unit that names have, and count nothing."""
+        numbers, times = self.known
+        units = (_MICROSECOND, *_UNITS.values())
+        return bool(times.any()) and any(np.abs(numbers * unit - times).max() < _MICROSECOND for unit in units)
 
     @property
     def step(self) -> float:
@@ -148,7 +161,7 @@ class Clock:
                 'give --map-fps, the frames per second of the video, or put {"fps": ...} into densify_map.json beside '
                 "it, to count frames by time; or write frame numbers as times",
             )
-        if stamped and (self.fps is None or self._same_clock(times)):
+        if stamped and self._stamps_tell(times):
             return self._by_stamp(times, where, begun)
         assert self.fps is not None
         offset = self._offset(times, where, begun, 0.0)
@@ -160,7 +173,7 @@ class Clock:
         stamped = self.frames is not None and len(self.frames.known[0]) > 0
         if self.time_offset is not None or (self.fps is None and (not stamped or (times == np.rint(times)).all())):
             return False
-        if stamped and (self.fps is None or self._same_clock(times)):
+        if stamped and self._stamps_tell(times):
             return self._no_frames_at(times)
         return bool(times.min() > _FOREIGN)
 
@@ -175,11 +188,12 @@ class Clock:
         assert self.frames is not None
         return self.time_tolerance if self.time_tolerance is not None else 0.5 * self.frames.step + 1e-6
 
-    def _same_clock(self, times: np.ndarray) -> bool:
-        """Whether the frames are stamped by the same clock of no video, such as Unix time: then stamps say more than
-        a rate."""
+    def _stamps_tell(self, times: np.ndarray) -> bool:
+        """Whether stamps say more than a rate: where there is none, where the frames' numbers are times themselves and
+        count nothing, and where both are of one clock of no video, such as Unix time."""
         assert self.frames is not None
-        return bool(self.frames.known[1][0] > _FOREIGN and times.min() > _FOREIGN and self.time_offset is None)
+        same_clock = self.frames.known[1][0] > _FOREIGN and times.min() > _FOREIGN and self.time_offset is None
+        return bool(self.fps is None or same_clock or self.frames.numbered_by_time)
 
     def _counted(self, counted: np.ndarray, times: np.ndarray, where: Path | str) -> list[str]:
         numbers = np.rint(counted)

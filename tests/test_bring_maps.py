@@ -137,8 +137,9 @@ def test_several_of_its_maps_are_submaps_on_one_clock(data, submap, tmp_path, pl
 # ---- names and times
 
 
-def test_frames_named_by_their_times_meet_a_map_of_their_names_and_one_of_times(data, submap, plain, tmp_path):
-    times = {f"{n:06d}": f"frame_{n / 30:05.2f}s" for n in range(COUNT)}
+@pytest.mark.parametrize("form", ["{:05.2f}s", "{:.4f}"])
+def test_frames_named_by_their_times_meet_a_map_of_their_names_and_one_of_times(data, submap, plain, tmp_path, form):
+    times = {f"{n:06d}": f"frame_{form.format(n / 30)}" for n in range(COUNT)}
     timed = tmp_path / "timed"
     shutil.copytree(data, timed)
     for image in sorted((timed / "frames").iterdir()):
@@ -151,6 +152,14 @@ def test_frames_named_by_their_times_meet_a_map_of_their_names_and_one_of_times(
     (tmp_path / "model" / "images.txt").write_text(text)
     assert met(timed, tmp_path / "model", "--map-rules.between", 1) == {n: r for n, r in right.items()}
     as_installed(submap, tmp_path / "out")
+    for older in (False, True):  # neither its own fps nor src_frm_id counts anything in such names
+        if older:
+            content = msgpack.unpackb((tmp_path / "out" / "map.msg").read_bytes())
+            for number, entry in enumerate(content["keyframes"].values()):
+                entry["src_frm_id"] = number
+            (tmp_path / "out" / "map.msg").write_bytes(msgpack.packb(content))
+        of_map = met(timed, tmp_path / "out", "--map-rules.between", 1)
+        assert {n: r[1] for n, r in of_map.items()} == {n: r[1] for n, r in right.items()}
     (tmp_path / "out" / "map.msg").unlink()
     shutil.copy(tmp_path / "model" / "points3D.txt", tmp_path / "out")
     found = met(timed, tmp_path / "out", "--map-rules.between", 1)
@@ -237,6 +246,12 @@ def test_a_map_that_counts_from_1_is_told_what_helps_and_it_helps(data, submap, 
         ("0012_color.png", 12, None),
         ("shot01.0001.png", 1, None),
         ("shot_01.0001.png", 1, None),
+        ("shot_01.1000.png", 1000, None),
+        ("frame_0.0333.png", 33_300, 0.0333),
+        ("frame_12.0333.png", 12_033_300, 12.0333),
+        ("frame-00.0667.png", 66_700, 0.0667),
+        ("left/img_0.00000.png", 0, 0.0),
+        ("0.0333.png", 33_300, 0.0333),
         ("out12", 12, None),
     ],
 )

@@ -77,7 +77,7 @@ def test_a_missing_file_and_one_that_is_no_text_are_refused_by_name(tmp_path):
     with refused(found="cannot be read"):
         read_json(tmp_path)
     (tmp_path / "image.json").write_bytes(b"\x89PNG\xff\xfe")
-    with refused(where="image.json", found="not valid JSON"):
+    with refused(where="image.json", found="not UTF-8"):
         read_json(tmp_path / "image.json")
 
 

@@ -119,6 +119,7 @@ def test_the_verb_gives_a_file_its_size_and_refuses_another_aspect(tmp_path, cap
     assert read_camera(tmp_path / "camera.json") == SMALL["PINHOLE"]
     argv = ["convert-camera", str(tmp_path / "camera.json"), "-o", str(tmp_path / "small.yaml"), "--size"]
     assert main([*argv, "[48, 48]"]) == 3 and "is for 96x80; expected the same aspect" in capsys.readouterr().err
+    assert main([*argv, "[0, 0]"]) == 3 and "--size: [0, 0]; expected a width" in capsys.readouterr().err
     assert main([*argv, "[48, 40]"]) == 0
     assert read_camera(tmp_path / "small.yaml").params == pytest.approx(SMALL["PINHOLE"].resized(48, 40).params)
 
@@ -129,3 +130,27 @@ def test_the_verb_says_to_which_model_a_camera_has_to_be_converted(tmp_path, cap
     said = capsys.readouterr().err
     assert "COLMAP has no SCARAMUZZA camera; it can be converted to OPENCV_FISHEYE or OPENCV or PINHOLE" in said
     assert not (tmp_path / "out.txt").exists()
+
+
+def test_the_verb_refuses_a_fit_that_is_far_off_with_its_residual(tmp_path, capsys):
+    write_camera(ENDOMAPPER.resized(96, 72), tmp_path / "camera.json")
+    argv = ["convert-camera", str(tmp_path / "camera.json"), "-o", str(tmp_path / "out.json"), "--model", "PINHOLE"]
+    assert main(argv) == 3
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the nearest PINHOLE is off by" in said and "(largest); expected 0.48 at most" in said
+    assert not (tmp_path / "out.json").exists()
+    assert main([*argv, "--most-px", "-1"]) == 3 and "positive number of pixels" in capsys.readouterr().err
+    assert main([*argv, "--most-px", "100"]) == 0 and (tmp_path / "out.json").exists()
+
+
+def test_an_ocamcalib_file_made_by_a_fit_is_within_the_stated_residual_or_is_not_made(tmp_path, capsys):
+    for name, model, code in (("a", "OPENCV", 0), ("b", "OPENCV_FISHEYE", 3)):
+        write_camera(SMALL[model], tmp_path / f"{name}.json")
+        argv = ["convert-camera", str(tmp_path / f"{name}.json"), "-o", str(tmp_path / name / "calib_results.txt")]
+        assert main([*argv, "--model", "SCARAMUZZA"]) == code
+    assert "the nearest SCARAMUZZA is off by" in " ".join(capsys.readouterr().err.split())
+    found = read_camera(tmp_path / "a" / "calib_results.txt")
+    rays, seen = SMALL["OPENCV"].rays()
+    pixels = found.project(rays[seen])[0]
+    rows, columns = np.nonzero(seen)
+    assert np.abs(pixels - np.stack([columns, rows], -1) - 0.5).max() < 0.48

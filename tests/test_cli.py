@@ -302,6 +302,7 @@ BAD_INPUT = {
     ),
     "mask": (["predict", "DATA", "--mask", "NOWHERE", "--checkpoint", "decline"], "nowhere: no such mask"),
     "frames": (["synth", "--frames", "0"], "--frames: 0; expected at least 1"),
+    "no pixels": (["synth", "--size", "[0, 0]"], "--size: [0, 0]; expected a width"),
     "too few frames": (["synth", "--frames", "2", "--size", "[24, 20]"], "render more frames"),
     "spurious": (["synth", "--spurious", "1.5"], "--spurious: 1.5"),
     "no run": (["evaluate", "NOWHERE", "--truth", "DATA"], "nowhere: no such folder"),

@@ -24,7 +24,8 @@ from lightdepth.cli import main
 from lightdepth.datasets import write_folder
 from lightdepth.decline import log_closed_form
 from lightdepth.exporting import graph
-from lightdepth.exporting.depth import depth_of, write_exr, write_png16
+from lightdepth.exporting.depth import depth_of
+from lightdepth.files.exr import read_exr, write_exr
 from lightdepth.files.images import read_image
 from lightdepth.frame import to_batch
 from lightdepth.models import NetworkModel, working_size
@@ -278,13 +279,54 @@ def test_depth_goes_to_exr_and_comes_back_by_openexr_to_the_last_bit(predictions
     for file in predictions.glob("*.npz"):
         with exr.File(str(folder / f"{file.stem}.exr")) as read:
             assert np.array_equal(read.channels()["Z"].pixels, depth_of(read_prediction(file)))
+        again = DepthReading("depth", 1.0).read(folder / f"{file.stem}.exr", FISHEYE)
+        assert np.abs(again.distance / truth_of(file) - 1)[again.valid].max() < 1e-5
     write_exr(tmp_path / "odd.exr", np.arange(15, dtype=np.float32).reshape(3, 5))
     with exr.File(str(tmp_path / "odd.exr")) as read:
         assert np.array_equal(read.channels()["Z"].pixels, np.arange(15).reshape(3, 5))
 
 
+@pytest.mark.parametrize("compression", ["NO", "ZIPS", "ZIP", "PIZ"])
+@pytest.mark.parametrize("kind", [np.float32, np.float16, np.uint32])
+def test_an_exr_of_openexr_s_is_read_to_the_last_bit_or_refused_by_its_compression(tmp_path, compression, kind):
+    exr = pytest.importorskip("OpenEXR")
+    rng = np.random.default_rng(0)
+    made = {"depth": rng.uniform(0, 99, (37, 21)).astype(kind), "sigma": np.zeros((37, 21), np.float32)}
+    header = {"compression": getattr(exr, f"{compression}_COMPRESSION"), "type": exr.scanlineimage}
+    exr.File(header, dict(made)).write(str(tmp_path / "a.exr"))
+    if compression == "PIZ":
+        with refused(found="PIZ compression", cure="ZIP"):
+            read_exr(tmp_path / "a.exr")
+        return
+    found = read_exr(tmp_path / "a.exr")
+    assert found.keys() == made.keys()
+    assert all(found[name].dtype == made[name].dtype and np.array_equal(found[name], made[name]) for name in made)
+
+
+def test_an_exr_that_is_cut_off_or_none_is_refused(tmp_path):
+    write_exr(tmp_path / "a.exr", np.ones((8, 9), np.float32))
+    whole = (tmp_path / "a.exr").read_bytes()
+    for length in range(4, len(whole), 7):
+        (tmp_path / "a.exr").write_bytes(whole[:length])
+        with refused(found="a broken EXR file"):
+            read_exr(tmp_path / "a.exr")
+    (tmp_path / "a.exr").write_bytes(b"no picture")
+    with refused(found="not an EXR file"):
+        read_exr(tmp_path / "a.exr")
+
+
 def test_depth_that_does_not_fit_16_bits_is_refused(predictions, tmp_path, capsys):
-    with refused(cure="--step"):
-        write_png16(tmp_path / "a.png", np.full((2, 2), 100.0), 1e-3)
-    assert main(["export", str(predictions), "-o", str(tmp_path / "o"), "--to", "png", "--step", "0"]) == 3
-    assert "positive" in capsys.readouterr().err
+    argv = ["export", str(predictions), "-o", str(tmp_path / "o"), "--to", "png", "--step"]
+    assert main([*argv, "1e-9"]) == 3
+    said = capsys.readouterr().err
+    assert "more than 65535 steps of 1e-09; give a larger one, such as 0.001" in said and str(tmp_path) not in said
+    for bad in ("0", "-1"):
+        assert main([*argv, bad]) == 3 and "positive" in capsys.readouterr().err
+    argv[argv.index("png")] = "exr"
+    assert main([*argv, "1"]) == 3 and "it is of png" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("size", ["[100, 0]", "[-5, 5]"])
+def test_a_size_of_no_pixels_is_refused_as_such(checkpoint, tmp_path, capsys, size):
+    assert main(["export", str(checkpoint), "-o", str(tmp_path / "o"), "--to", "torch", "--size", size]) == 3
+    assert f"--size: {size}; expected a width and a height" in capsys.readouterr().err

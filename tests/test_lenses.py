@@ -127,6 +127,35 @@ def test_opencv_s_coefficients_are_exact_with_k3_and_the_rational_terms(tmp_path
     assert silently(tmp_path / "again.yaml").params == pytest.approx(camera.params, rel=1e-14)
 
 
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_opencv_s_xml_is_read_as_its_yaml(tmp_path, fisheye):
+    terms = FISHEYE if fisheye else [-0.2664, -0.0386, 0.0018, -0.0003, 0.2384]
+    storage = cv2.FileStorage(str(tmp_path / "a.xml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Mon 3 Mar 2025")
+    storage.startWriteStruct("image_size", cv2.FileNode_SEQ)
+    for side in (640, 480):
+        storage.write("", side)
+    storage.endWriteStruct()
+    storage.write("camera_matrix", np.array(K))
+    storage.write("distortion_coefficients", np.array([terms]))
+    storage.write("per_view_errors", np.array([0.3, 0.2]))
+    if fisheye:
+        storage.write("camera_model", "fisheye")
+    storage.release()
+    assert main(["convert-camera", str(tmp_path / "a.xml"), "-o", str(tmp_path / "camera.json")]) == 0
+    camera = silently(tmp_path / "camera.json")
+    rays = rays_of(camera)
+    assert len(rays) > 250
+    assert off(camera, opencv_pixels(rays, K, terms, fisheye), rays) < 1e-9
+
+
+def test_a_matrix_without_a_size_is_told_of_the_option_that_gives_one(tmp_path, capsys):
+    file = written(tmp_path / "a.yaml", {"K": K, "D": [0.0] * 5})
+    argv = ["convert-camera", str(file), "-o", str(tmp_path / "camera.json")]
+    assert main(argv) == 3 and "--size" in capsys.readouterr().err
+    assert main([*argv, "--size", "[640, 480]"]) == 0
+
+
 # ---- by fit
 
 
@@ -167,6 +196,15 @@ def test_a_fisheye_is_one_by_whatever_key_it_is_called_so(tmp_path, key, word):
     camera = silently(written(tmp_path / "a.yaml", {**SIZE, key: word, "K": K, "D": FISHEYE}))
     rays = rays_of(camera)
     assert isinstance(camera, KannalaBrandt)
+    assert off(camera, opencv_pixels(rays, K, FISHEYE, fisheye=True), rays) < 1e-9
+
+
+@pytest.mark.parametrize("key", ["coefficients", "dist_coeffs", "distortion_params", "D"])
+def test_a_fisheye_s_coefficients_are_read_under_whatever_key(tmp_path, key):
+    camera = silently(
+        written(tmp_path / "a.yaml", {**SIZE, "camera_model": "fisheye", "camera_matrix": K, key: FISHEYE})
+    )
+    rays = rays_of(camera)
     assert off(camera, opencv_pixels(rays, K, FISHEYE, fisheye=True), rays) < 1e-9
 
 

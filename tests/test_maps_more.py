@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from test_maps import FISHEYE, PINHOLE, assert_equal_maps, edit, refusal, scene
 
 from lightdepth.calibration import write_camera
-from lightdepth.camera import Brown, Pinhole, Scaramuzza
+from lightdepth.camera import Brown, FullBrown, Pinhole, Scaramuzza
 from lightdepth.maps import read_map, write_stella, write_text_model
 from lightdepth.sparse_map import Keyframe, Submap
 
@@ -236,6 +236,24 @@ def test_the_camera_beside_the_map_stands_in_for_an_incomplete_one_and_the_file_
     assert_equal_maps(read_map(stella(path, lambda c: None)).submaps[0], scene(FISHEYE), atol=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore:.*median reprojection error")  # the keypoints are another lens's
+def test_a_third_radial_term_is_read_exactly_and_radial_division_as_the_nearest_of_our_lenses(tmp_path):
+    folded = FullBrown(640, 480, 500.0, 510.0, 322.25, 238.5, -0.2, 0.05, 0.001, -0.002, -0.01, 0.0, 0.0, 0.0)
+    write_stella(scene(folded), tmp_path / "k3.msg")
+    assert_equal_maps(read_map(tmp_path / "k3.msg").submaps[0], scene(folded), atol=1e-9)
+
+    def division(content):
+        content["cameras"]["camera 0"].update(model_type="RadialDivision", distortion=-0.1)
+
+    path = stella(tmp_path / "division.msg", division)
+    with pytest.warns(UserWarning, match=r"cameras.camera 0: DIVISION lens read as .*\(largest\)"):
+        camera = read_map(path).submaps[0].keyframes[0].camera
+    where = np.array([0.3, -0.2])  # on the plane of the lens, x = (u - cx) / fx
+    ray = np.append(where / (1 - 0.1 * where @ where), 1)
+    fx, fy, cx, cy = FISHEYE.params[:4]
+    assert camera.project(ray)[0] == pytest.approx(where * (fx, fy) + (cx, cy), abs=0.01)
+
+
 def test_keyframes_without_a_frame_number_are_counted_by_time_where_the_rate_is_declared(tmp_path):
     def by_time(content):
         for entry in content["keyframes"].values():
@@ -275,7 +293,7 @@ def test_keyframes_without_a_frame_number_are_counted_by_time_where_the_rate_is_
             "model_type: found 'Equirectangular'",
         ),
         (lambda c: c["cameras"]["camera 0"].update(fx="wide"), "cameras.camera 0.fx: found ['wide']"),
-        (lambda c: c["cameras"]["camera 0"].update(model_type="Perspective", p1=0, p2=0), "k3: found 0.0017"),
+        (lambda c: c["cameras"]["camera 0"].update(model_type="Perspective", p1=0, p2=0, k3="x"), "k3: found ['x']"),
     ],
 )
 def test_a_stella_field_that_cannot_be_read_is_refused_with_file_and_field(tmp_path, change, says):

@@ -31,6 +31,7 @@ UNIT = re.compile(
 """A unit, or the word for a number that has none."""
 MORE = re.compile(r"(?:^|[.;] )(More|Larger|A larger|A higher|A longer|Another)\b")
 """A sentence on what a larger number does; of seeds and places, what another one does."""
+ROOT = Path(__file__).parents[1]
 GENERAL = ("help", "config", "print_config", "print_shtab", "overwrite", "resume")
 
 
@@ -139,6 +140,17 @@ def test_help_has_two_examples_and_the_everyday_options_and_fits_100_columns(ver
 
 
 @every_verb
+@pytest.mark.parametrize("word", ["--help", "--help-all"])
+def test_help_spells_every_option_with_dashes(verb, word, capsys):
+    assert re.findall(r"--[a-z][\w.-]*_[\w.-]*", help_of(verb, word, capsys)) == []
+
+
+def test_the_documents_spell_options_with_dashes():
+    for document in (ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("data/**/*.md"), ROOT / "CHANGELOG.md"):
+        assert re.findall(r"--[a-z][\w.-]*_[\w.-]*", document.read_text(encoding="utf-8")) == [], document
+
+
+@every_verb
 def test_the_names_on_a_page_are_options_of_the_verb(verb):
     names = {a.dest for a in options(parsers()[verb])}
     assert set(PAGES[verb].more) | set(PAGES[verb].rare) <= names
@@ -148,7 +160,10 @@ def test_the_names_on_a_page_are_options_of_the_verb(verb):
 def test_help_all_shows_every_option_with_its_sentence(verb, capsys):
     shown = "".join(help_of(verb, "--help-all", capsys).split())
     for action in options(parsers()[verb]):
-        assert (action.option_strings[-1].removesuffix("+") if action.option_strings else action.dest) in shown
+        spelled = (
+            action.option_strings[-1].removesuffix("+").replace("_", "-") if action.option_strings else action.dest
+        )
+        assert spelled in shown
         assert "".join((action.help or "").split()) in shown
 
 
@@ -182,7 +197,7 @@ def test_a_mistyped_option_is_told_the_nearest_one_in_one_line(verb, capsys):
     wrong = f"{longest[:-2]}{longest[-1]}{longest[-2]}q"
     needed = [a.dest for a in options(parsers()[verb]) if not a.option_strings]
     line = told(verb, [*needed, "-o", "out", wrong, "1"], capsys)
-    assert f"no option {wrong}; did you mean {longest}?" in line
+    assert f"no option {wrong}; did you mean {longest.replace('_', '-')}?" in line
     assert difflib.get_close_matches(wrong, names, 1)
 
 
@@ -195,7 +210,7 @@ MISTAKES = {
     "a single dash": ("densify", ["D", "-o", "O", "-mask", "x"], "did you mean --mask?"),
     "before what is missing": ("densify", ["--mpa", "x"], "no option --mpa; did you mean --map?"),
     "nothing is like it": ("densify", ["D", "-o", "O", "--qqq", "1"], "no option --qqq. Read on"),
-    "dashes": ("densify", ["D", "-o", "O", "--mm-per-unt", "3"], "--mm_per_unit?"),
+    "dashes": ("densify", ["D", "-o", "O", "--mm-per-unt", "3"], "did you mean --mm-per-unit?"),
     "choice": ("synth", ["-o", "O", "--layout", "c3d"], "one of frames, c3vd, endomapper; did you mean c3vd?"),
     "format": ("densify", ["D", "-o", "O", "--format", "colmap"], "--format colmap: expected one of folder, c3vd"),
     "lens": ("synth", ["-o", "O", "--lens", "rear"], "--lens rear: expected one of pinhole, telescope, fisheye, c3vd."),

@@ -15,6 +15,7 @@ from PIL import Image
 
 from lightdepth.cli import main
 from lightdepth.datasets import write_folder
+from lightdepth.files.exr import write_exr
 from lightdepth.metrics import ALIGNMENTS, NAMES
 
 FRAMES = colon(0).frames[:3]
@@ -55,6 +56,7 @@ WRITERS: dict[str, Callable[[Path, np.ndarray], object]] = {
     "npy": lambda p, v: np.save(p, v),
     "npy of a batch of one, in double precision": lambda p, v: np.save(p, v[None, None].astype(np.float64)),
     "npz": lambda p, v: np.savez(p, depth=v, colour=np.zeros((4, 3))),
+    "exr": write_exr,
     "tiff": lambda p, v: cv2.imwrite(str(p), v),
     "png": lambda p, v: Image.fromarray(np.rint(v * 256).astype(np.uint16)).save(p),
 }
@@ -147,6 +149,29 @@ def test_what_is_no_depth_is_refused_and_named(data, tmp_path, capsys):
     assert "no depth files" in refusal(nothing, "--depth-kind", "depth")
     assert "given without --depth-kind" in refusal(eight, "--depth-scale", "2")
     assert "positive" in refusal(eight, "--depth-kind", "depth", "--depth-scale", "0")
+
+
+def aligned(found: dict) -> dict:
+    """The figures that one factor on all of a frame's depth does not change."""
+    return {name: value for name, value in found["mean"].items() if not name.endswith("_none")}
+
+
+def test_our_own_folders_say_what_they_hold_and_are_judged_as_nothing_else(data, tmp_path, capsys):
+    predicted, depth = tmp_path / "predicted", tmp_path / "depth"
+    assert main(["predict", str(data), "-o", str(predicted), "--checkpoint", "decline", "--previews", "false"]) == 0
+    right = aligned(judged(predicted, data))
+    argv = ["--truth", str(data), "-o", str(tmp_path / "out"), "--depth-kind"]
+    assert main(["evaluate", str(predicted), *argv, "depth"]) == 3
+    assert f"depth, but {predicted} holds distance along the ray" in capsys.readouterr().err
+    for to in ("exr", "png"):
+        assert main(["export", str(predicted), "-o", str(depth / to), "--to", to]) == 0
+        found = aligned(judged(depth / to, data, "--depth-kind", "depth"))
+        assert found == pytest.approx(right, rel=1e-3, abs=1e-4)
+        assert main(["evaluate", str(depth / to), *argv, "distance"]) == 3
+        assert "holds depth along the axis" in capsys.readouterr().err
+    (predicted / "run.json").unlink()  # its files say so, too
+    assert main(["evaluate", str(predicted), *argv, "disparity"]) == 3
+    assert "distance along the ray, as `lightdepth predict` writes it" in capsys.readouterr().err
 
 
 def test_metrics_of_another_program_s_folder_are_never_written_into_it(data, tmp_path, capsys):

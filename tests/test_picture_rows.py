@@ -290,6 +290,17 @@ def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path, plain):
     assert [frame.time for frame in open_sequence(data)] == [0.5, 1.5]
 
 
+def test_a_calibration_in_another_encoding_is_refused_as_such(tmp_path, capsys):
+    data = write(tmp_path / "data", None, count=2)
+    text = (data / "camera.json").read_text().rstrip().rstrip("}") + ', "note": "caméra"}'
+    for encoding in ("latin-1", "utf-16"):
+        (data / "camera.json").write_bytes(text.encode(encoding))
+        assert "camera.json: not UTF-8" in refusal(capsys, "predict", data, "-o", tmp_path / "out")
+    (tmp_path / "k.yaml").write_bytes("# caméra\nK: [1, 2]\n".encode("latin-1"))
+    said = refusal(capsys, "convert-camera", tmp_path / "k.yaml", "-o", tmp_path / "c.json")
+    assert "not a text file in UTF-8 (at byte 5)" in said
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
 def test_names_that_are_not_utf_8_lose_no_work(tmp_path, plain):
     data = write(tmp_path / "data", None, count=2).rename(tmp_path / os.fsdecode(b"\xe9tude \xff"))

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 from test_cli import SMALL, lightdepth
+
+from lightdepth.command_line.warned import warnings_as_sentences
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +33,23 @@ def test_a_run_stands_when_nobody_reads_what_it_says(data, tmp_path, monkeypatch
         monkeypatch.undo()
     assert json.loads((tmp_path / "run" / "run.json").read_text())["failures"] == []
     assert len(list((tmp_path / "run").rglob("*.npz"))) == 8 and not list(tmp_path.glob(".run-*"))
+
+
+def test_a_warning_is_one_sentence_without_a_place_in_the_code(tmp_path):
+    (tmp_path / "k.yaml").write_text("{image_width: 640, image_height: 480, K: [0.9, 1.1, 0.5, 0.5], D: [0, 0, 0, 0]}")
+    argv = [sys.executable, "-m", "lightdepth", "convert-camera", "k.yaml", "-o", "camera.json"]
+    done = subprocess.run(argv, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("warning: k.yaml: camera_matrix is in parts of the image's sides") and ".py" not in line
+
+
+def test_how_warnings_look_is_changed_for_the_command_alone(tmp_path):
+    before = warnings.formatwarning
+    with warnings_as_sentences():
+        assert warnings.formatwarning("two\nlines", UserWarning, "a.py", 3) == "warning: two lines\n"
+        assert "a.py:3: DeprecationWarning" in warnings.formatwarning("old", DeprecationWarning, "a.py", 3)
+    assert warnings.formatwarning is before
 
 
 @pytest.mark.parametrize("group", ["judge", "judge.parallax", "bending"])

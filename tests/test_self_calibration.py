@@ -74,6 +74,11 @@ def test_without_a_camera_the_way_out_is_named_by_every_verb(tmp_path, capsys):
     data = written(tmp_path / "data", box_film(across(60, 50, 90), 2))
     assert main(["predict", str(data), "-o", str(tmp_path / "a"), "--checkpoint", "decline"]) == 3
     assert "--camera auto" in capsys.readouterr().err
+    for verb in ("predict", "sparse"):
+        assert main([verb, str(data), "-o", str(tmp_path / "c"), "--camera", "auto"]) == 3
+        said = " ".join(capsys.readouterr().err.split())
+        assert "--camera auto: 2 frames, of 3 that their motion needs; give --camera FILE, or --fov DEGREES" in said
+        assert "_" not in said.split("--camera auto")[1]  # no name of the program's inside
     assert main(["adapt", str(data), "-o", str(tmp_path / "b"), "--camera", "auto"]) == 3
     assert "lightdepth import" in capsys.readouterr().err
 

@@ -104,7 +104,7 @@ def test_keyframes_are_ten_to_twenty_frames_apart_unless_it_is_said():
     (submap,) = simulate_slam(frames, replace(TRACKED, maps=1), 0).map.submaps
     gaps = np.diff([k.number for k in submap.keyframes])
     assert gaps.min() >= 10 and gaps.max() <= 20 and len(set(gaps)) > 1
-    with refused(where="2 maps", cure="--slam.keyframe_every"):
+    with refused(where="2 maps", cure="--slam.keyframe-every"):
         simulate_slam(frames[:25], TRACKED, 0)
 
 

@@ -212,6 +212,46 @@ def test_a_mistyped_option_is_wrong_usage(capsys):
     assert stopped.value.code == 2
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("val_check_interval 0.5", "expected a whole number of batches, or --trainer.check-val-every-n-epoch 1"),
+        ("val_check_interval 0", "a number of batches above 0"),
+        ("val_check_interval 1.5 check_val_every_n_epoch 1", "a share of an epoch, above 0 and up to 1.0"),
+        ("check_val_every_n_epoch 0", "a number above 0, or null"),
+        ("max_steps 0", "a number above 0, or -1 for no limit"),
+        ("max_epochs -2", "a number above 0, or -1 for no limit"),
+        ("limit_val_batches 0", "is chosen and judged on validation frames"),
+        ("limit_train_batches 1.5", "a share above 0 and up to 1.0, or a number of batches"),
+        ("accumulate_grad_batches 0", "a number above 0"),
+        ("accelerator cpu devices 9999", "at most, the cores of this machine"),
+        ("profiler bogus", "Lightning says: "),
+        ("strategy bogus", "Lightning says: You selected an invalid strategy name"),
+        ("accelerator cpu limit_train_batches 0.01", "Lightning says: You requested to check 0.01"),
+    ],
+)
+def test_a_setting_that_cannot_train_is_refused_by_name(tmp_path, options, said):
+    words = options.split()
+    given = [word for name, value in zip(words[::2], words[1::2], strict=True) for word in (f"--trainer.{name}", value)]
+    with refused(said, where="--trainer"):
+        train(["-o", str(tmp_path / "run"), *TINY_RUN, "--trainer.max_steps", "2", *given])
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
+def test_settings_of_lightning_s_that_do_nothing_are_no_options_and_old_files_that_have_them_are_read(tmp_path, capsys):
+    gone = {"limit_test_batches": 3, "model_registry": None, "barebones": False, "enable_checkpointing": True}
+    with pytest.raises(SystemExit):
+        train(["--help-all"])
+    shown = capsys.readouterr().out
+    assert not any(f"--trainer.{name.replace('_', '-')}" in shown for name in gone)
+    (tmp_path / "old.yaml").write_text(json.dumps({"trainer": {**gone, "max_steps": 77}}))
+    said = "settings that are no more are left out: .*limit_test_batches"
+    with pytest.warns(UserWarning, match=said) as warned, pytest.raises(SystemExit) as stopped:
+        train(["--config", str(tmp_path / "old.yaml"), "--print_config"])
+    assert stopped.value.code == 0 and len(warned) == 1
+    assert "max_steps: 77" in capsys.readouterr().out
+
+
 def test_the_validation_line_names_network_and_closed_form():
     metrics = {f"val/{p}{n}_median": 0.5 for p in ("", "closed_form/") for n in ("abs_rel", "rmse_mm", "medae_mm")}
     assert "closed form AbsRel 0.5" in validation_line({**metrics, "val/loss": 1.0})

@@ -39,10 +39,10 @@ class FrameData:
     to be there."""
     val_sequences: list[str] | None = None
     """Folders of frames, or videos, to validate on: they teach nothing, and choose the best checkpoint. Left out, the
-    end of each training sequence does that (--data.held_out)."""
+    end of each training sequence does that (--data.held-out)."""
     split: str | None = None
     """YAML file that says which sequences train and which validate (data/*/splits/*.yaml); its test sequences are never
-    read. It takes the place of --data.sequences and --data.val_sequences, and needs --data.root."""
+    read. It takes the place of --data.sequences and --data.val-sequences, and needs --data.root."""
     root: str | None = None
     """Folder in which the sequences that --data.split names are looked for; given with it, and only with it."""
     frames: str | None = None
@@ -176,7 +176,7 @@ class FrameDataModule(pl.LightningDataModule):
             raise InputError("data", "nothing to train on", "give --data.sequences FOLDER, or --data.tube.scenes N")
         if not val:
             raise InputError(
-                "data", "nothing to validate on", "give --data.val_sequences FOLDER, or --data.tube.val_scenes N"
+                "data", "nothing to validate on", "give --data.val-sequences FOLDER, or --data.tube.val-scenes N"
             )
         self._train, self._val = ConcatDataset(train), ConcatDataset(val)
 

@@ -13,13 +13,15 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import lightning.pytorch as pl
 import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import (
     EarlyStopping,
     EMAWeightAveraging,
@@ -44,6 +46,7 @@ from .card import Card, Doubt
 from .colons import TubeData
 from .datamodule import FrameDataModule
 from .running import quiet, report_every
+from .trainer_options import check_trainer_options
 
 _OURS = (
     *("config.yaml", "log.txt", "tensorboard", "checkpoints", "model.safetensors", "model.md", "uncertainty.png"),
@@ -119,6 +122,7 @@ def fit(
             f"{trainer_options['precision']}, but the physics of light needs float32",
             "expected 32-true, 16-mixed or bf16-mixed",
         )
+    check_trainer_options(trainer_options)
     check_output(output, resume, overwrite)
     started = time.time()
     quiet()
@@ -138,10 +142,12 @@ def fit(
         f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
     )
     options = _with_callbacks(trainer_options, output, echo, data, settings)
-    trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the command line's parser checked them against Trainer
+    with _refusals_named(MisconfigurationException, ValueError, TypeError):
+        trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the parser checked them against Trainer
     if resume:
         echo(f"resuming from {last.name}" if resumed else "nothing to resume: starting anew")
-    trainer.fit(model, datamodule=data, ckpt_path=resumed, weights_only=True)
+    with _refusals_named(MisconfigurationException):
+        trainer.fit(model, datamodule=data, ckpt_path=resumed, weights_only=True)
     train_loss = trainer.callback_metrics.get("train/loss")
 
     best = checkpoints / "best.ckpt"
@@ -185,6 +191,18 @@ def fit(
         }
         write_run_json(output, "train", {"argv": arguments or []}, started, record)
     return errors
+
+
+@contextmanager
+def _refusals_named(*kinds: type[Exception]) -> Iterator[None]:
+    """What Lightning says of settings that it cannot run with, as of a user's other mistakes."""
+    try:
+        yield
+    except InputError:
+        raise  # of ours, which is a ValueError
+    except kinds as error:
+        found = " ".join(str(error).split()).rstrip(".")
+        raise InputError("--trainer", f"Lightning says: {found}", "see lightdepth train --help-all") from error
 
 
 @torch.no_grad()

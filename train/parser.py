@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from lightdepth.command_line.pages import PAGES
 
-from .trainer_options import TRAINER_OPTIONS
+from .trainer_options import TRAINER_OPTIONS, WITHOUT
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -53,7 +53,7 @@ def training_parser() -> Parser:
     parser.add_class_arguments(LightDepth, "model")
     parser.add_class_arguments(FrameData, "data")
     parser.add_class_arguments(FitConfig, "fit")
-    parser.add_class_arguments(pl.Trainer, "trainer", instantiate=False, skip={"default_root_dir"})
+    parser.add_class_arguments(pl.Trainer, "trainer", instantiate=False, skip=WITHOUT)
     parser.link_arguments("seed", "data.seed")
     parser.link_arguments("data.size", "model.rows", compute_fn=lambda size: size[1])
     parser.set_defaults(TRAINER_DEFAULTS)

@@ -1,5 +1,24 @@
-"""What the options of Lightning's Trainer do, in a sentence each: its own docstrings are written for programs."""
+"""What the options of Lightning's Trainer do, in a sentence each, as its own docstrings are written for programs; which
+of them a run does not have, and which values end it.
+"""
 
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+from lightdepth.errors import InputError
+
+WITHOUT = {
+    "default_root_dir",  # the run's folder
+    "limit_test_batches",
+    "limit_predict_batches",  # training neither tests nor predicts
+    "enable_autolog_hparams",
+    "model_registry",  # settings and checkpoints are written by the run itself
+    "enable_checkpointing",
+    "barebones",  # a run has checkpoints and a log
+}
+"""Options of the Trainer that do nothing here, or end the run whatever they are."""
 _SENTENCES = {
     "accelerator": "Kind of device to train on: cpu, gpu (cuda), mps (Apple's), or auto, the fastest that is there.",
     "strategy": "How several devices share the work, by Lightning's name, such as ddp (each has a copy of the network "
@@ -30,10 +49,6 @@ _SENTENCES = {
     "of batches (5); left out, all. More show more frames in an epoch; how long a run takes, max_steps says.",
     "limit_val_batches": "How much of the validation frames is used: a share of their batches (0.5), or a number of "
     "batches (5); left out, all. More judge more surely and take longer.",
-    "limit_test_batches": "Share or number of the test batches, of which training has none: it has no effect. More "
-    "change nothing.",
-    "limit_predict_batches": "Share or number of the batches to predict, of which training has none: it has no "
-    "effect. More change nothing.",
     "overfit_batches": "Share (0.5) or number (5) of the training batches that are trained on again and again, in one "
     "order, to see whether the network can learn them by heart; as much is validated on. 0.0 trains as usual. More "
     "are harder to learn by heart.",
@@ -46,8 +61,6 @@ _SENTENCES = {
     "them shows at once; 0 for none, -1 for all. More find mistakes more surely, and training begins later.",
     "log_every_n_steps": "Number of steps from one point of the logged training curves to the next. More make coarser "
     "curves and smaller files.",
-    "enable_checkpointing": "To be left out: the run always writes its checkpoints. true changes nothing, and false "
-    "ends it with an error.",
     "enable_progress_bar": "true: a progress bar is shown. false: none is. Left out, there is one where messages go "
     "to a terminal. Lines on progress are printed in any case.",
     "enable_model_summary": "true: the layers of the network and their numbers of weights are listed before training "
@@ -70,17 +83,64 @@ _SENTENCES = {
     "in more detail and slower. Left out, nothing does.",
     "detect_anomaly": "true: where a gradient is not a number, PyTorch names the operation that it came from; much "
     "slower. false: it does not look.",
-    "barebones": "To be left at false: true, in which Lightning measures its own overhead, does not go together with "
-    "the run's log and checkpoints, and ends it with an error.",
     "plugins": "Lightning plugins, by their classes, that change how it computes in other precisions, works in a "
     "cluster or writes checkpoints. Left out, Lightning's own.",
     "sync_batchnorm": "Of several devices, true takes the mean and deviation of batch normalisation over the frames "
     "of all of them, and false over those of each. With one device it changes nothing.",
     "reload_dataloaders_every_n_epochs": "Number of epochs (passes over the training frames) after which what reads "
     "the frames is started anew; 0 for never. The frames stay the same. More do it less often.",
-    "enable_autolog_hparams": "Whether Lightning logs the settings: it has no effect, because a run has them in its "
-    "config.yaml, not in its logs.",
-    "model_registry": "Name of the model in Lightning's model hub: it has no effect, because the run writes its "
-    "checkpoints itself, into its folder.",
 }
 TRAINER_OPTIONS = {f"trainer.{name}": sentence for name, sentence in _SENTENCES.items()}
+
+
+def check_trainer_options(options: Mapping[str, object]) -> None:
+    """Raises InputError where a value would end the run with an error of Lightning's, or with nothing trained."""
+    for name in ("max_steps", "max_epochs"):
+        value = options.get(name)
+        if isinstance(value, int) and (value == 0 or value < -1):
+            raise _wrong(name, value, "a number above 0, or -1 for no limit")
+    for name in ("accumulate_grad_batches", "num_nodes"):
+        value = options.get(name, 1)
+        if isinstance(value, int) and value < 1:
+            raise _wrong(name, value, "a number above 0")
+    for name in ("limit_train_batches", "limit_val_batches"):
+        value = options.get(name)
+        if isinstance(value, int | float) and not (0 < value <= 1 or (isinstance(value, int) and value > 1)):
+            cure = "a share above 0 and up to 1.0, or a number of batches"
+            if name == "limit_val_batches" and value == 0:
+                cure += ": the checkpoint that is exported is chosen and judged on validation frames"
+            raise _wrong(name, value, cure)
+    _check_interval(options.get("val_check_interval"), options.get("check_val_every_n_epoch", 1))
+    devices, cores = _count(options.get("devices")), os.cpu_count() or 1
+    if devices > max(2, cores) and _on_cpu(options.get("accelerator", "auto")):
+        raise _wrong("devices", devices, f"{cores} at most, the cores of this machine")
+
+
+def _count(devices: object) -> int:
+    """How many devices a number or a word such as "4" asks for; 1 where it asks for none by number."""
+    if isinstance(devices, int):
+        return devices
+    return int(devices) if isinstance(devices, str) and devices.strip().isdecimal() else 1
+
+
+def _on_cpu(accelerator: object) -> bool:
+    """Whether each device would be one more process on this machine's processor."""
+    import torch
+
+    return accelerator == "cpu" or (accelerator == "auto" and not torch.cuda.is_available())
+
+
+def _check_interval(interval: object, epochs: object) -> None:
+    if isinstance(epochs, int) and epochs < 1:
+        raise _wrong("check_val_every_n_epoch", epochs, "a number above 0, or null")
+    if isinstance(interval, float) and epochs is None:
+        cure = "a whole number of batches, or --trainer.check-val-every-n-epoch 1 beside it for a share of an epoch"
+        raise _wrong("val_check_interval", interval, cure)
+    if isinstance(interval, float) and not 0 < interval <= 1:
+        raise _wrong("val_check_interval", interval, "a share of an epoch, above 0 and up to 1.0")
+    if isinstance(interval, int) and interval < 1:
+        raise _wrong("val_check_interval", interval, "a number of batches above 0")
+
+
+def _wrong(name: str, value: object, expected: str) -> InputError:
+    return InputError(f"--trainer.{name.replace('_', '-')}", f"{value}", f"expected {expected}")

@@ -55,6 +55,8 @@ def export(
     model = _network(what) if to in get_args(MODEL_KINDS) else None
     if size is not None and to not in ("onnx", "torch"):
         raise InputError("--size", f"given with --to {to}", "leave it out: it is of onnx and torch")
+    if size is not None and min(size) < 1:
+        raise InputError("--size", f"{list(size)}", "expected a width and a height of some pixels")
     with run_folder(output, "export", arguments, overwrite) as run:
         if model is not None:
             export_model(run, model, to, size, half)

@@ -37,7 +37,7 @@ def measure(
             the first pixel at (0.5, 0.5); in place of --points. Two give the length between them. More give the area
             inside the outline whose corners they are.
         radius: Radius of the part of the wall around a single place, a straight distance, in mm where the run or
-            --mm_per_unit gives the scale, else map units. A larger one measures more wall.
+            --mm-per-unit gives the scale, else map units. A larger one measures more wall.
         map: Number of the map to measure on, as in the name of its folder; needed where the run has several. Another
             one is another surface.
         mm_per_unit: Millimetres that a unit of the surface stands for, where the run did not know it; lengths are then

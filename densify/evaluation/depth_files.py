@@ -1,4 +1,4 @@
-"""Depth that any other program predicted, as the files that such programs write: .npz, .npy, TIFF, 16-bit PNG.
+"""Depth that any other program predicted, as the files that such programs write: .npz, .npy, EXR, TIFF, 16-bit PNG.
 
 A file holds one array (H, W), of one of three kinds, s the scale that the user gives:
 
@@ -22,17 +22,20 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from densify.dense_map import run_record
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
+from lightdepth.files.exr import read_exr
 from lightdepth.files.images import read_raw
 from lightdepth.geometry import distance_from_depth
 from lightdepth.prediction import DepthPrediction, read_prediction
 
 DepthKind = Literal["distance", "depth", "disparity"]
-SUFFIXES = ("npz", "npy", "tiff", "tif", "png")
+SUFFIXES = ("npz", "npy", "exr", "tiff", "tif", "png")
 """Endings that are read, the first that a folder has: a picture often lies beside the numbers."""
 _NAMES = ("distance", "depth", "disparity", "disp", "pred", "prediction", "arr_0")
+_CHANNELS = ("Z", *_NAMES[:4], "V", "Y", "R")
 _UNREADABLE = (OSError, EOFError, ValueError, TypeError, zipfile.BadZipFile, zlib.error)
 _LEAST_RAY_Z = 0.05  # as of true depth: farther to the side, depth along the axis says nothing
 
@@ -42,8 +45,9 @@ class DepthReading:
     """How a folder of depth is read. Without a kind it is one that `lightdepth predict` made."""
 
     depth_kind: DepthKind | None = None
-    """What the numbers of another program's depth files are (.npy, .npz, TIFF, 16-bit PNG): distance along the ray,
-    depth along the axis, or disparity, which is one over depth. Left out, the folder is one of `lightdepth predict`."""
+    """What the numbers of another program's depth files are (.npy, .npz, EXR, TIFF, 16-bit PNG): distance along the
+    ray, depth along the axis, or disparity, which is one over depth. Left out, the folder is one of `lightdepth
+    predict`."""
     depth_scale: float | None = None
     """Factor from the numbers in another program's depth files to mm (of disparity: depth is the factor over it). Left
     out, they are up to scale. A larger one makes a farther wall."""
@@ -58,6 +62,7 @@ class DepthReading:
 
     def files(self, folder: Path) -> dict[int, Path]:
         """The depth files of a folder, by the number in their names. Raises InputError where there is none."""
+        self._check_own(folder)
         for suffix in SUFFIXES if self.depth_kind else SUFFIXES[:1]:
             found = numbered_files(folder, rf".*?(\d+)\D*\.{suffix}")
             if found:
@@ -70,6 +75,21 @@ class DepthReading:
             f"expected one for each frame, such as 000012.npy, ending in {', '.join(SUFFIXES)}",
         )
 
+    def _check_own(self, folder: Path) -> None:
+        """Raises InputError where the folder is of this program, and so says itself what it holds, which is another."""
+        record = run_record(folder)
+        if not isinstance(record, Mapping):
+            return
+        own = {"predict": "distance", "export": "depth"}.get(str(record.get("verb", "")))
+        if own is None or self.depth_kind in (None, own) or (own == "depth" and "kind" not in record):
+            return
+        along = {"distance": "distance along the ray", "depth": "depth along the axis"}[own]
+        raise InputError(
+            "--depth-kind",
+            f"{self.depth_kind}, but {folder} holds {along} (its run.json says: {record['verb']})",
+            f"give --depth-kind {own}" + (", or leave it out" if own == "distance" else ""),
+        )
+
     def read(self, path: Path, camera: CameraModel) -> DepthPrediction:
         """What a file says of a frame of this camera. Raises InputError where it does not hold what is expected."""
         if self.depth_kind is None:
@@ -78,7 +98,7 @@ class DepthReading:
             except InputError as error:
                 cure = f"{error.cure}; of another program's depth say --depth-kind distance, depth or disparity"
                 raise InputError(error.where, error.found, cure) from error
-        values, valid = _array(path)
+        values, valid = _array(path, self.depth_kind)
         valid &= np.isfinite(values) & (values > 0)
         if not valid.any():
             raise InputError(path, "no finite number above 0 in it", "leave it out, or is it of another kind?")
@@ -99,10 +119,17 @@ def other_depth(path: Path) -> bool:
     return path.is_dir() and any(numbered_files(path, rf".*?(\d+)\D*\.{suffix}") for suffix in SUFFIXES)
 
 
-def _array(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _array(path: Path, kind: DepthKind) -> tuple[np.ndarray, np.ndarray]:
     """The numbers (H, W) of a file, and which of them it calls valid."""
     if path.suffix == ".npz":
-        values, valid = _chosen(_load_npz(path), path)
+        arrays = _load_npz(path)
+        if kind != "distance" and arrays.keys() >= {"meta", "distance", "valid"}:  # as DepthPrediction is saved
+            raise InputError(
+                path, "distance along the ray, as `lightdepth predict` writes it", "leave out --depth-kind"
+            )
+        values, valid = _chosen(arrays, path)
+    elif path.suffix == ".exr":
+        values, valid = _channel(read_exr(path), path), None
     else:
         values, valid = (_load_npy(path) if path.suffix == ".npy" else read_raw(path)), None
     shape = values.shape
@@ -145,6 +172,19 @@ def _chosen(arrays: Mapping[str, np.ndarray], path: Path) -> tuple[np.ndarray, n
     valid = arrays.get("valid")
     fits = valid is not None and valid.dtype == bool and valid.shape == numbers[named[0]].shape
     return numbers[named[0]], valid if fits else None
+
+
+def _channel(channels: Mapping[str, np.ndarray], path: Path) -> np.ndarray:
+    """The depth of an EXR: its only channel, one with a known name, or any of three that are the same."""
+    found = next((name for name in _CHANNELS if name in channels), next(iter(channels)))
+    grey = all(np.array_equal(channels[found], channels[other], equal_nan=True) for other in "GB" if other in channels)
+    if (found not in _CHANNELS and len(channels) > 1) or (found == "R" and not grey):
+        raise InputError(
+            path,
+            f"channels {', '.join(channels)}: none is known as depth",
+            f"expected one channel, or one with the name {', '.join(_CHANNELS[:5])}",
+        )
+    return channels[found]
 
 
 def _resized(metric: np.ndarray, valid: np.ndarray, camera: CameraModel, path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -13,10 +13,11 @@ from lightdepth.files import images
 
 
 def known_camera(camera: CameraModel, names: tuple[str, ...], instead: str) -> tuple[CameraModel, str]:
-    """The camera itself where a program knows its model, else the nearest one of `instead`, and what to say of it."""
+    """The camera itself where a program knows its model, else the nearest one of `instead`, and what to say of it.
+    Raises InputError where that is too far off."""
     if camera.name in names:
         return camera, ""
-    found = convert_camera(camera, instead)
+    found = convert_camera(camera, instead).close_enough(f"{camera.name} camera")
     said = (
         f"{instead} in place of {camera.name}: off by {found.median_px:.2g} px (median), {found.max_px:.2g} px "
         f"(largest), over {found.seen_share:.1%} of the field"

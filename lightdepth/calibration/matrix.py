@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lightdepth.calibration.other_programs import FISHEYE_WORDS, letters
+from lightdepth.calibration.other_programs import FISHEYE_WORDS, letters, needed_size
 from lightdepth.camera import CameraModel, KannalaBrandt, camera_from_params, camera_of, opencv_camera
 from lightdepth.errors import InputError
 from lightdepth.files.text import to_numbers
@@ -56,6 +56,10 @@ _COEFFICIENTS = (
     "distortioncoeff",
     "distortionparameters",
     "distortionparams",
+    "distcoefficients",
+    "coefficients",
+    "coeffs",
+    "coefs",
 )
 _MODELS = (
     "distortionmodel",
@@ -188,9 +192,9 @@ def _size_of(fields: Fields, path: Path, size: tuple[int, int] | None) -> tuple[
         found = _pair(fields[key], f"{path}: {key}")[::-1]
     else:
         missing = "image_width" if wide is None else "image_height"
-        if size is None or wide is not None or high is not None:
+        if wide is not None or high is not None:
             raise _missing(missing, path)
-        return size
+        return needed_size(size, str(path), "image_width and image_height")
     width, height = (
         _whole(value, f"{path}: {name}") for value, name in zip(found, ("image_width", "image_height"), strict=True)
     )

@@ -1,4 +1,4 @@
-"""YAML, OpenCV's FileStorage among it: read safely (nothing is executed), and OpenCV's written.
+"""YAML, and OpenCV's FileStorage in YAML or XML: read safely (nothing is executed), and OpenCV's YAML written.
 
 What the keys mean is told by `matrix` (a camera matrix and OpenCV's coefficients) and `other_programs`.
 """
@@ -13,6 +13,7 @@ import yaml
 from lightdepth.calibration.matrix import matrix_and_distortion, matrix_numbers
 from lightdepth.calibration.other_programs import other_program
 from lightdepth.calibration.plain_text import cannot_hold
+from lightdepth.calibration.xml_text import opencv_fields
 from lightdepth.camera import Brown, CameraModel, FullBrown, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
 from lightdepth.files.text import read_text
@@ -32,8 +33,8 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):  # the second is OpenCV 5's f
 
 
 def read_opencv(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
-    """The camera of a YAML. Keys in any case; what is not about the camera is passed over. `size` (width, height) is
-    that of the images, for files that hold none."""
+    """The camera of a YAML, or of OpenCV's XML. Keys in any case; what is not about the camera is passed over. `size`
+    (width, height) is that of the images, for files that hold none."""
     return camera_of_keys(_fields(path), path, size)
 
 
@@ -55,6 +56,11 @@ def read_matrices(path: Path, names: tuple[str, ...]) -> dict[str, list[float]]:
 def _fields(path: Path) -> dict[str, Any]:
     """Everything in the file, by its key in small letters."""
     text = read_text(path, "expected an OpenCV YAML").lstrip("\ufeff")
+    if text.lstrip().startswith("<"):
+        stored = opencv_fields(path)
+        if stored is None:
+            raise InputError(path, "XML of another program's", "expected OpenCV's, an <opencv_storage>")
+        return stored
     # OpenCV's first line, `%YAML:1.0`, is no YAML.
     text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
     try:

@@ -33,9 +33,9 @@ from lightdepth.files.text import read_text, rows
 from lightdepth.photometry import PhotometricCalibration
 
 CAMERA_FORMATS = (
-    "camera.json, vicalib XML (EndoMapper), OpenCV, ROS, Kalibr, ORB-SLAM or stella_vslam YAML, COLMAP cameras.txt or "
-    "cameras.bin, nerfstudio's transforms.json, ocamcalib calib_results.txt, MATLAB .mat, or intrinsics.txt (3x3 or "
-    "4x4 numbers)"
+    "camera.json, vicalib XML (EndoMapper), OpenCV's YAML or XML, ROS, Kalibr, ORB-SLAM or stella_vslam YAML, COLMAP "
+    "cameras.txt or cameras.bin, nerfstudio's transforms.json, ocamcalib calib_results.txt, MATLAB .mat, or "
+    "intrinsics.txt (3x3 or 4x4 numbers)"
 )
 
 
@@ -71,11 +71,12 @@ def _read(path: Path, size: tuple[int, int] | None) -> CameraModel:
         return _read_json(path, size)
     text = read_text(path, f"expected {CAMERA_FORMATS}")
     start = text.lstrip("\ufeff \t\r\n")
-    if start.startswith("{"):
+    if start.startswith("{") and suffix not in (".yaml", ".yml"):  # flow style is YAML, too
         return _read_json(path, size)
-    if start.startswith("<"):
+    stored = re.search(r"<opencv_storage\b", start[:2000]) is not None
+    if start.startswith("<") and not stored:
         return _plausible(read_vicalib(path), path)
-    if start.startswith("%YAML") or path.suffix.lower() in (".yaml", ".yml"):
+    if stored or start.startswith("%YAML") or suffix in (".yaml", ".yml"):
         return _plausible(read_opencv(path, size), path)
     lines = rows(text)
     if lines and len(lines[0]) > 2 and re.fullmatch(r"[A-Z][A-Z0-9_]+", lines[0][1]):

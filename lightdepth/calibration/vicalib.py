@@ -17,11 +17,10 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import defusedxml.ElementTree
 import numpy as np
-from defusedxml import DefusedXmlException
 
 from lightdepth.calibration.plain_text import cannot_hold
+from lightdepth.calibration.xml_text import xml_root
 from lightdepth.camera import (
     Brown,
     CameraModel,
@@ -34,7 +33,7 @@ from lightdepth.camera import (
     opencv_camera,
 )
 from lightdepth.errors import InputError
-from lightdepth.files.text import read_text, to_numbers
+from lightdepth.files.text import to_numbers
 from lightdepth.files.writing import write_whole
 from lightdepth.photometry import PhotometricCalibration
 
@@ -49,7 +48,7 @@ _FARTHEST_LIGHT_M = 0.1  # no light on an endoscope's tip is farther from the le
 
 def read_vicalib(path: Path) -> CameraModel:
     """The one camera of a geometric calibration."""
-    root = _root(path)
+    root = xml_root(path)
     model = _only(root, "camera_model", path)
     kind = model.get("type", "")
     if kind == "gamma":
@@ -95,7 +94,7 @@ def write_vicalib(camera: CameraModel, path: Path) -> None:
 
 def read_photometric(path: Path) -> PhotometricCalibration:
     """Light and response of EndoMapper's photometric calibration. Metres become millimetres."""
-    root = _root(path)
+    root = xml_root(path)
     if root.find(".//light_model") is None and root.find(".//params") is not None:
         raise InputError(path, "a geometric calibration", "expected a photometric one. This is --camera's")
     light = _only(root, "light_model", path)
@@ -144,20 +143,6 @@ def write_photometric(light: PhotometricCalibration, path: Path) -> None:
 
 def _row(numbers: tuple[float, ...] | list[float]) -> str:
     return f"[ {'; '.join(repr(float(v)) for v in numbers)} ]"
-
-
-def _root(path: Path) -> Element:
-    text = read_text(path, "expected an XML of vicalib's").lstrip("\ufeff")
-    try:
-        root = defusedxml.ElementTree.fromstring(text, forbid_dtd=True)
-    except DefusedXmlException as error:
-        raise InputError(path, "has a DTD or entities, which are refused", "expected plain XML") from error
-    except SyntaxError as error:
-        raise InputError(path, f"not valid XML ({error})", "correct it there") from error
-    if root.tag == "opencv_storage":
-        raise InputError(path, "OpenCV's XML", "expected vicalib's. Save it as .yaml, which is read")
-    result: Element = root
-    return result
 
 
 def _only(root: Element, tag: str, path: Path) -> Element:

@@ -11,10 +11,17 @@ from pathlib import Path
 from typing import Any
 
 _WITHHOLD = "the surface uses every point; blocks of wall judge it, see judge.folds"
+_NO_EFFECT = "it had no effect"
+_ALWAYS = "a run always has its log and checkpoints"
 GONE_SETTINGS: dict[str, dict[str, str]] = {
     "import": {"source": "it is data now, as with the other verbs"},
     "densify": {"withhold": _WITHHOLD, "seed": "it drew withheld points; judge.seed draws blocks of wall"},
     "demo": {"withhold": _WITHHOLD},
+    "train": {
+        **dict.fromkeys(("trainer.limit_test_batches", "trainer.limit_predict_batches"), _NO_EFFECT),
+        **dict.fromkeys(("trainer.enable_autolog_hparams", "trainer.model_registry"), _NO_EFFECT),
+        **dict.fromkeys(("trainer.enable_checkpointing", "trainer.barebones"), _ALWAYS),
+    },
 }
 """By verb, the dotted keys that are gone, each with what became of it. A key stands for all that is below it."""
 

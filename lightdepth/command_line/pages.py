@@ -32,7 +32,7 @@ PAGES = {
     "doctor": Page(("lightdepth doctor", "lightdepth doctor && lightdepth demo")),
     "synth": Page(
         (
-            "lightdepth synth -o runs/colon --errors.side_share 0.3 --errors.side_factor 1.2",
+            "lightdepth synth -o runs/colon --errors.side-share 0.3 --errors.side-factor 1.2",
             "lightdepth synth -o runs/real --family realistic --frames 80 --travel-mm 60",
         ),
         more=("slam.maps", "slam.kind"),

@@ -32,6 +32,7 @@ from lightdepth.command_line.settings_yaml import read_settings, use_words
 
 HELP, HELP_ALL = ("-h", "--help"), ("--help-all", "--help_all")
 _WIDTH = 100
+_OPTION = re.compile(r"(?<![\w/.-])--[A-Za-z][\w.-]*")
 _GENERAL = {
     "help": "Show the everyday options, with examples, and exit.",
     "config": "YAML file with any of these options; those on the command line win.",
@@ -102,7 +103,8 @@ class Parser(ArgumentParser):
         head, gap, tail = page.partition("\n\n")
         summary, _, tail = tail.partition("\n\n")
         examples = "".join(f"\n  {example}" for example in self.page.examples)
-        return f"{head}{gap}{summary}\n\nexamples:{examples}\n\n{tail}" if examples else page
+        page = f"{head}{gap}{summary}\n\nexamples:{examples}\n\n{tail}" if examples else page
+        return _OPTION.sub(lambda found: dashed(found[0]), page)
 
     def _short_usage(self) -> str:
         words = [a.dest.upper() for a in self._actions if not a.option_strings and a.help != argparse.SUPPRESS]
@@ -206,6 +208,11 @@ def spelled(parser: ArgumentParser, argv: Sequence[str]) -> list[str]:
     return result
 
 
+def dashed(name: str) -> str:
+    """An option as it is shown; it can be typed either way."""
+    return name.replace("_", "-")
+
+
 def _underscored(word: str) -> str:
     if not word.startswith("--"):
         return word
@@ -257,7 +264,7 @@ def one_line(parser: Parser, argv: Sequence[str], message: str) -> str:
     elif found := re.search(r"the following arguments are required: (.+)", message):
         said = f"missing: {', '.join(_typed(parser, dest) for dest in found[1].split(', '))}"
     elif found := re.search(r"argument (\S+?): expected one argument", message):
-        said = f"{found[1].split('/')[0]} needs a value"
+        said = f"{dashed(found[1].split('/')[0])} needs a value"
     elif found := re.search(r"Problems parsing config: (.*)", message, re.DOTALL):
         files = [path for path in _config_files(argv) if not _is_yaml(path)]
         said = f"{files[0] if files else '--config'}: not YAML: {' '.join(found[1].split())}"
@@ -273,7 +280,7 @@ def _unknown(parser: Parser, word: str) -> tuple[str, str]:
         return f"{word}: nothing takes this word; options begin with --", ""
     name = word.partition("=")[0]
     nearest = closest(name.lstrip("-").replace("-", "_"), _names(parser))
-    return f"no option {name}" + (f"; did you mean --{nearest}?" if nearest else ""), nearest
+    return f"no option {name}" + (f"; did you mean --{dashed(nearest)}?" if nearest else ""), nearest
 
 
 def _names(parser: Parser) -> list[str]:
@@ -302,7 +309,7 @@ def _typed(parser: Parser, dest: str) -> str:
     action = next((a for a in options(parser) if a.dest == dest), None)
     if action is None or not action.option_strings:
         return dest.upper()
-    return f"{action.option_strings[0]} {dest.upper()}"
+    return f"{dashed(action.option_strings[0])} {dest.upper()}"
 
 
 def _wrong_value(parser: Parser, argv: Sequence[str], key: str, message: str) -> str:
@@ -310,7 +317,7 @@ def _wrong_value(parser: Parser, argv: Sequence[str], key: str, message: str) ->
     given = re.search(r"(?:Got value|Given value): (.*?)\s*$", message, re.DOTALL | re.MULTILINE)
     kind = getattr(action, "_typehint", None)
     where, value = _file_with(argv, key) if not _on_line(argv, key) else "", given[1].strip() if given else ""
-    named = f"{key}:" if where or action is None or not action.option_strings else f"--{key}"
+    named = f"{key}:" if where or action is None or not action.option_strings else f"--{dashed(key)}"
     if kind is None or not value:
         return f"{where}{named} {' '.join(message.split())}"
     choices = [c for one in choices_of_type(kind) for c in literals(one)]
@@ -325,7 +332,7 @@ def _on_line(argv: Sequence[str], key: str) -> bool:
 def _config_files(argv: Sequence[str]) -> Iterator[Path]:
     for word, following in pairwise([*argv, ""]):
         path = following if word == "--config" else word.removeprefix("--config=") if word[:9] == "--config=" else ""
-        if path and Path(path).is_file():
+        if path and "\n" not in path and Path(path).is_file():  # settings may stand there themselves (gone_settings)
             yield Path(path)
 
 

@@ -18,13 +18,14 @@ def convert_camera(
     size: tuple[int, int] | None = None,
     to: Literal["json", "vicalib", "opencv", "colmap", "ocamcalib", "intrinsics", "intrinsics4x4"] | None = None,
     mask: Path | None = None,
+    most_px: float | None = None,
     overwrite: bool = False,
 ) -> None:
     """A calibration file in another format, or as another lens model, and by how many pixels that differs.
 
     Args:
-        file: Calibration of any kind that is read: camera.json, vicalib XML, OpenCV YAML, COLMAP, ocamcalib or
-            intrinsics.txt.
+        file: Calibration of any kind that is read: camera.json, vicalib XML, OpenCV's YAML or XML, Kalibr, ORB-SLAM,
+            nerfstudio, MATLAB, COLMAP, ocamcalib or intrinsics.txt.
         output: File to write the camera to, in a format that its name tells.
         model: Lens model to have instead, fitted by least squares: PINHOLE (no distortion), OPENCV, OPENCV_FISHEYE or
             SCARAMUZZA; left out, the file's own stays.
@@ -33,10 +34,16 @@ def convert_camera(
         to: Format of the output: json, vicalib (XML), opencv (YAML), colmap, ocamcalib, or intrinsics.txt as 3 x 3 or 4
             x 4 matrix; left out, the one that the output's name tells.
         mask: Image, white where tissue shows: with --model, only these pixels count in the fit; left out, all do.
+        most_px: With --model, the most that the fit may be off anywhere in the image, pixels: a worse one is refused.
+            Left out, half a percent of the image's longer side. A larger one lets a worse fit through.
         overwrite: Replace a file made before.
     """
     if output.exists() and not overwrite:
         raise InputError(output, "already there", "choose another -o, or give --overwrite")
+    if size is not None and min(size) < 1:
+        raise InputError("--size", f"{list(size)}", "expected a width and a height of some pixels")
+    if most_px is not None and not most_px > 0:
+        raise InputError("--most-px", f"{most_px:g}", "expected a positive number of pixels")
     camera = read_camera(file, size)
     if size is not None and size != (camera.width, camera.height):
         if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > 0.01:
@@ -53,7 +60,7 @@ def convert_camera(
             raise InputError(
                 f"{mask}", f"{counted.shape[1]}x{counted.shape[0]} pixels", f"expected {camera.width}x{camera.height}"
             )
-        found = camera_conversion.convert_camera(camera, model, counted)
+        found = camera_conversion.convert_camera(camera, model, counted).close_enough(f"{file}", most_px)
         said = (
             f"{model} in place of {camera.name}: residual {found.median_px:.2g} px (median), {found.max_px:.2g} px "
             f"(largest), over the {100 * found.seen_share:.1f} % of the field that it can represent"

@@ -44,8 +44,8 @@ def import_frames(
 
     Args:
         output: Folder to make, with the sequence and the report.
-        overlay_mask: Image of the frames' size, white where text is to be blacked out, besides what --find_text finds.
-        find_text: Look for text burnt into the frames, and black it out; switched off, only what --overlay_mask marks
+        overlay_mask: Image of the frames' size, white where text is to be blacked out, besides what --find-text finds.
+        find_text: Look for text burnt into the frames, and black it out; switched off, only what --overlay-mask marks
             is.
         frames: Write the frames; switched off, only the report is written, with no image of the patient, fit for
             mailing.

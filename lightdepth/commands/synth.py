@@ -30,7 +30,7 @@ class ColonConfig:
     """Lens of the endoscope: pinhole (90 degrees across), telescope (70), fisheye (136) or c3vd (that of the data set
     C3VD)."""
     frames: int = 120
-    """Number of frames to render, spread evenly over --travel_mm. More lie closer together on the same path, and take
+    """Number of frames to render, spread evenly over --travel-mm. More lie closer together on the same path, and take
     longer."""
     size: tuple[int, int] = (320, 256)
     """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
@@ -52,6 +52,8 @@ class ColonConfig:
     def __post_init__(self) -> None:
         if self.frames < 1:
             raise InputError("--frames", f"{self.frames}", "expected at least 1")
+        if min(self.size) < 1:
+            raise InputError("--size", f"{list(self.size)}", "expected a width and a height of some pixels")
 
     def rendered(
         self, scene: TubeConfig, breathing: BreathingConfig, progress: Callable[[int, int], None]

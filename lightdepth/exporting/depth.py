@@ -1,12 +1,11 @@
 """Predictions as pictures of depth: 16-bit PNG, and EXR with 32-bit numbers.
 
 A PNG's code is depth over a step; the step is the same for all frames of a folder, and 0 is where nothing is known.
-The EXR has one channel Z, float32, without compression: lines from the top, each with its number and length.
+The EXR has one channel Z, float32 (`files.exr`).
 """
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -27,40 +26,24 @@ def depth_of(prediction: DepthPrediction) -> np.ndarray:
 
 
 def write_png16(path: Path, depth: np.ndarray, step: float) -> None:
-    """Depth (H, W) in steps. Raises InputError where one does not fit 16 bits."""
+    """Depth (H, W) in steps, which `checked_step` has found to fit 16 bits."""
     codes = np.rint(depth.astype(np.float64) / step)
-    if codes.max(initial=0) > CODES:
-        raise InputError(
-            path, f"depth {depth.max():.4g} is more than {CODES} steps of {step:g}", "give a larger --step"
-        )
+    assert codes.max(initial=0) <= CODES, (path, step)
     codes = np.where(depth > 0, np.maximum(codes, 1), 0)  # what is known is never 0
     write_image(path, codes.astype(np.uint16))
 
 
-def write_exr(path: Path, values: np.ndarray, channel: str = "Z") -> None:
-    """(H, W) as one float32 channel (OpenEXR file layout, version 2, scan lines, no compression)."""
-    height, width = values.shape
-    lines = np.ascontiguousarray(values, "<f4")
-
-    def attribute(name: str, kind: str, data: bytes) -> bytes:
-        return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(data)) + data
-
-    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
-    float32, sampling = 2, (1, 1)
-    channels = channel.encode() + b"\0" + struct.pack("<iB3x2i", float32, 0, *sampling) + b"\0"
-    header = struct.pack("<2i", 20000630, 2)
-    header += attribute("channels", "chlist", channels)
-    header += attribute("compression", "compression", b"\0")
-    header += attribute("dataWindow", "box2i", window) + attribute("displayWindow", "box2i", window)
-    header += attribute("lineOrder", "lineOrder", b"\0")
-    header += attribute("pixelAspectRatio", "float", struct.pack("<f", 1))
-    header += attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0))
-    header += attribute("screenWindowWidth", "float", struct.pack("<f", 1)) + b"\0"
-    size = 8 + 4 * width
-    first = len(header) + 8 * height
-    offsets = struct.pack(f"<{height}Q", *(first + size * row for row in range(height)))
-    body = b"".join(struct.pack("<2i", row, 4 * width) + lines[row].tobytes() for row in range(height))
-    path.write_bytes(header + offsets + body)
+def checked_step(step: float, largest: float, unit: str) -> float:
+    """The step, or InputError where it is none or the largest depth is more than 16 bits of it."""
+    if not (np.isfinite(step) and step > 0):
+        raise InputError("--step", f"{step:g}", "expected a positive depth of one code")
+    if largest / step > CODES:
+        raise InputError(
+            "--step",
+            f"the farthest depth, {largest:.4g}, is more than {CODES} steps of {step:g}",
+            f"give a larger one, such as {fitting_step(largest, unit):g}, or leave it out",
+        )
+    return step
 
 
 def fitting_step(largest: float, unit: str) -> float:

@@ -7,7 +7,8 @@ from typing import Literal
 
 from lightdepth.errors import InputError
 from lightdepth.exporting.checkpoints import GRAPH_FILES, GraphKind, write_graph, write_pretrained
-from lightdepth.exporting.depth import depth_of, fitting_step, write_exr, write_png16
+from lightdepth.exporting.depth import checked_step, depth_of, fitting_step, write_png16
+from lightdepth.files.exr import write_exr
 from lightdepth.models import NetworkModel
 from lightdepth.prediction import read_prediction
 from lightdepth.reporting.run import Run
@@ -33,13 +34,13 @@ def export_model(run: Run, model: NetworkModel, to: str, size: tuple[int, int] |
 def export_depth(run: Run, folder: Path, to: str, step: float | None) -> None:
     """Depth along the axis of every prediction of a folder, as 16-bit PNG or EXR."""
     files = sorted(folder.glob("*.npz"))
-    if step is not None and not step > 0:
-        raise InputError("--step", f"{step}", "expected a positive depth of one code")
+    if step is not None and to != "png":
+        raise InputError("--step", f"given with --to {to}", "leave it out: it is of png")
     unit, largest = "", 0.0
     for file in files:
         prediction = read_prediction(file)
         unit, largest = prediction.unit, max(largest, float(depth_of(prediction).max()))
-    chosen = step or fitting_step(largest, unit)
+    chosen = fitting_step(largest, unit) if step is None else checked_step(step, largest, unit)
     for file in files:
         depth = depth_of(read_prediction(file))
         if to == "png":
@@ -48,5 +49,6 @@ def export_depth(run: Run, folder: Path, to: str, step: float | None) -> None:
             write_exr(run.folder / f"{file.stem}.exr", depth)
     run.record.update({"kind": "depth along the axis", "unit": unit, "step": chosen if to == "png" else None})
     scale = f" --depth-scale {chosen:g}" if unit == "mm" else ""
-    codes = f"; one code is {chosen:g} (evaluate --depth-kind depth{scale})" if to == "png" else ""
+    scale = scale if to == "png" or unit != "mm" else " --depth-scale 1"
+    codes = f"{f'; one code is {chosen:g}' if to == 'png' else ''} (evaluate --depth-kind depth{scale})"
     run.log(f"{len(files)} files of depth along the axis, {unit}, 0 where unknown{codes}")

@@ -22,6 +22,8 @@ def read_json(path: Path) -> Any:
         raise InputError(
             path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
         ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, f"not UTF-8 (at byte {error.start})", "save it as UTF-8") from error
     except ValueError as error:
         raise InputError(path, f"not valid JSON ({error})", "correct it there") from error
 

@@ -17,7 +17,7 @@ def read_text(path: Path, expected: str) -> str:
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror or error})", expected) from error
     except UnicodeDecodeError as error:
-        raise InputError(path, "not a text file", expected) from error
+        raise InputError(path, f"not a text file in UTF-8 (at byte {error.start})", expected) from error
     if "\0" in text:
         raise InputError(path, "not a text file", expected)
     return text

@@ -22,7 +22,16 @@ import msgpack
 import numpy as np
 
 from lightdepth.calibration import read_camera
-from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
+from lightdepth.camera import (
+    Brown,
+    CameraModel,
+    FullBrown,
+    KannalaBrandt,
+    Pinhole,
+    camera_from_params,
+    camera_of,
+    opencv_camera,
+)
 from lightdepth.errors import InputError
 from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
 from lightdepth.files.schema import read_json
@@ -33,9 +42,10 @@ from lightdepth.sparse_map import Keyframe, Submap, at_its_place
 from lightdepth.which_frame import Clock, frame_number
 
 Begun = tuple[float, str] | None
-_LENSES = {  # model_type -> our model, the fields of its distortion
-    "Perspective": ("OPENCV", ("k1", "k2", "p1", "p2")),
-    "Fisheye": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+_LENSES = {  # model_type -> the fields of its distortion; Perspective has a k3 besides, which older versions leave out
+    "Perspective": ("k1", "k2", "p1", "p2"),
+    "Fisheye": ("k1", "k2", "k3", "k4"),
+    "RadialDivision": ("distortion",),
 }
 
 
@@ -163,15 +173,21 @@ def _keyframe(entry: Mapping[Any, Any], where: str, frame: str, cameras: _Camera
 
 def _names(entries: Mapping[str, Mapping[Any, Any]], cameras: _Cameras, path: Path, begun: Begun) -> list[str]:
     """Each keyframe's frame: by src_frm_id, which stella_vslam no longer writes, else by its time."""
-    if all("src_frm_id" in entry for entry in entries.values()):
+    if _counted(entries, cameras.convention.clock):
         return [f"{_integer(e['src_frm_id'], f'{where}.src_frm_id'):06d}.png" for where, e in entries.items()]
     times = np.array([_time(entry, where) for where, entry in entries.items()])
     return cameras.clock(entries).names(times, path, begun)
 
 
+def _counted(entries: Mapping[str, Mapping[Any, Any]], clock: Clock) -> bool:
+    """Whether keyframes meet frames by src_frm_id, a count from 0: not where frames are numbered by their times."""
+    by_time = clock.frames is not None and clock.frames.numbered_by_time
+    return not by_time and all("src_frm_id" in entry for entry in entries.values())
+
+
 def _guesses(entries: Mapping[str, Mapping[Any, Any]], clock: Clock) -> bool:
     """Whether the keyframes' times are of a clock whose beginning had to be guessed."""
-    if all("src_frm_id" in entry for entry in entries.values()):
+    if _counted(entries, clock):
         return False
     return clock.guesses(np.array([_time(entry, where) for where, entry in entries.items()]))
 
@@ -251,26 +267,24 @@ class _Cameras:
 
 
 def _camera(entry: Mapping[Any, Any], where: str) -> CameraModel:
-    """In the file's own pixels. Raises InputError for a lens that is not ours, and for a field that is missing."""
+    """In the file's own pixels; a lens that none of ours is exactly becomes the nearest, which is said. Raises
+    InputError for one that is not known, and for a field that is missing."""
     model = str(_field(entry, "model_type", where))
     if model not in _LENSES:
         raise InputError(f"{where}.model_type", f"found {model!r}", f"expected {' or '.join(_LENSES)}")
-    name, terms = _LENSES[model]
 
     def number(field: str) -> float:
         return float(_numbers({field: [_field(entry, field, where)]}, field, 1, where)[0])
 
-    if model == "Perspective" and "k3" in entry and number("k3") != 0:
-        raise InputError(f"{where}.k3", f"found {entry['k3']}", "expected 0, the lens model has no third radial term")
-    size = (int(number("cols")), int(number("rows")))
-    focal = [number(field) for field in ("fx", "fy", "cx", "cy")]
-    bent = [number(field) for field in terms]
-    try:
-        if name == "OPENCV_FISHEYE":
-            return KannalaBrandt(*size, *focal, *bent)
-        return Brown(*size, *focal, *bent) if any(bent) else Pinhole(*size, *focal)
-    except InputError as error:
-        raise error.within(where) from error
+    width, height = int(number("cols")), int(number("rows"))
+    numbers = [number(field) for field in ("fx", "fy", "cx", "cy", *_LENSES[model])]
+    if model == "Fisheye":
+        return camera_of(lambda: KannalaBrandt(width, height, *numbers), where)
+    if model == "RadialDivision":
+        return camera_from_params("DIVISION", width, height, numbers, where)
+    if "k3" in entry:
+        numbers.append(number("k3"))
+    return camera_of(lambda: opencv_camera(width, height, numbers), where)
 
 
 # ---- writing
@@ -313,12 +327,17 @@ def _keyframe_fields(keyframe: Keyframe, camera: str) -> dict[str, Any]:
 
 
 def _camera_fields(camera: CameraModel) -> dict[str, Any]:
-    models: dict[type, str] = {Pinhole: "Perspective", Brown: "Perspective", KannalaBrandt: "Fisheye"}
-    if type(camera) not in models:
+    models: dict[type, str] = {
+        Pinhole: "Perspective",
+        Brown: "Perspective",
+        FullBrown: "Perspective",
+        KannalaBrandt: "Fisheye",
+    }
+    if type(camera) not in models or (isinstance(camera, FullBrown) and any((camera.k4, camera.k5, camera.k6))):
         raise InputError(f"{camera.name} camera", "stella_vslam has no such lens", f"expected {' or '.join(_LENSES)}")
     model = models[type(camera)]
     params = camera.with_pixel_center(1.0).params  # moves the origin by -0.5: ours to OpenCV's
-    terms = dict.fromkeys(_LENSES[model][1], 0.0) | dict(zip(_LENSES[model][1], params[4:], strict=False))
+    terms = dict.fromkeys(_LENSES[model], 0.0) | dict(zip(_LENSES[model], params[4:], strict=False))
     focal = dict(zip(("fx", "fy", "cx", "cy"), params[:4], strict=True))
-    third = {"k3": 0.0} if model == "Perspective" else {}
+    third = {"k3": camera.k3 if isinstance(camera, FullBrown) else 0.0} if model == "Perspective" else {}
     return {"model_type": model, "cols": camera.width, "rows": camera.height, **focal, **terms, **third}

@@ -9,12 +9,17 @@ from typing import Literal
 Progress = Callable[[str, int, int], None]
 """Called with the stage ("images", "features", "matches", "mapping"), how much of it is done, and of how much."""
 
-ADVICE = (
+_MOTION = (
     "what helps: more frames; at least 5 mm of travel with some of it sideways (pure forward motion over 3 mm fails); "
-    "sharp frames (blurred ones have no features); the calibration of this very image size; "
-    "a mask that leaves the tissue free. A lower `peak_threshold` finds more features in smooth tissue"
+    "sharp frames (blurred ones have no features); a mask that leaves the tissue free"
+)
+ADVICE = (
+    f"{_MOTION}; the calibration of this very image size. A lower --sfm.peak-threshold finds more features in smooth "
+    "tissue"
 )
 """What a user can do whose frames do not connect."""
+ADVICE_WITHOUT_CAMERA = f"give --camera FILE, or --fov DEGREES to assume a pinhole; {_MOTION}"
+"""The same where it is the camera that is looked for."""
 
 
 @dataclass(frozen=True)

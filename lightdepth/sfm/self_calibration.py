@@ -26,7 +26,7 @@ from lightdepth.camera import CameraModel, Pinhole, camera_from_params
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.native import pycolmap
-from lightdepth.sfm.config import ADVICE, Progress, SfmConfig
+from lightdepth.sfm.config import ADVICE_WITHOUT_CAMERA, Progress, SfmConfig
 from lightdepth.sfm.features import features_and_matches, quiet, write_images
 from lightdepth.sfm.mapping import mapping_options
 from lightdepth.sfm.reconstruction import silent
@@ -104,6 +104,9 @@ def self_calibrated(
     config, progress = config or SfmConfig(), progress or silent
     if fov is not None and not 10 <= fov <= 175:
         raise InputError("--fov", f"{fov:g} degrees", "expected the field across the image's width, from 10 to 175")
+    if len(frames) < config.min_model_size:
+        found = f"{len(frames)} frame{'s' * (len(frames) != 1)}, of {config.min_model_size} that their motion needs"
+        raise InputError("--camera auto", found, ADVICE_WITHOUT_CAMERA)
     with tempfile.TemporaryDirectory(prefix="self-calibration-") as folder:
         work = Path(folder)
         for part in ("images", "masks"):
@@ -160,7 +163,7 @@ def _best(endings: Sequence[_Ending], frames: int, config: SfmConfig) -> _Ending
         raise InputError(
             "the frames",
             f"no camera could be found from their motion: at most {most} of {frames} connect",
-            f"give --camera FILE, or --fov DEGREES to assume a pinhole; {ADVICE}",
+            ADVICE_WITHOUT_CAMERA,
         )
     whole = [e for e in endings if e.images >= _MAPPED * most]
     best = {m: min((e for e in whole if e.model == m), key=lambda e: e.error, default=None) for m in _FIELDS}

@@ -128,7 +128,7 @@ def simulate_slam(
         raise InputError(
             f"{config.maps} maps",
             f"{len(keyframes)} keyframes cannot be shared among them",
-            "render more frames, or make more of them keyframes (--slam.keyframe_every)",
+            "render more frames, or make more of them keyframes (--slam.keyframe-every)",
         )
     submaps, sims, wrong = [], {}, {}
     for map_id, part in enumerate(_parts(len(keyframes), config.maps, config.shared_keyframes)):

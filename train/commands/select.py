@@ -81,7 +81,7 @@ def select(
         output: Text file to write with the names of the kept frames, one a line; beside it come a table of all frames
             (.csv), a sheet of pictures (_contact.png) and a page (.html).
         map: Sparse map of the frames (a SLAM export or a COLMAP model): which keyframes see the same wall (are
-            covisible) is then read from it, by --map_rules, and no images are matched.
+            covisible) is then read from it, by --map-rules, and no images are matched.
         matcher: What matches images where there is no --map: sift, by single features; loftr, by a network, which finds
             matches on smoother tissue, takes longer and needs --loftr.weights. Its options begin with its name.
         format: Format of the frames: folder (images with camera.json), video, or the data set c3vd, simcol, hamlyn,

@@ -235,7 +235,7 @@ class MapRules:
     for the frames between them to be kept as well; 1 keeps keyframes only. More keep more frames."""
     published: bool = True
     """true: where camerasModel.txt (EndoMapper) lies beside the map, it says which keyframes are covisible, and
-    --map_rules.points is not asked. false: the points always say it."""
+    --map-rules.points is not asked. false: the points always say it."""
 
     def __post_init__(self) -> None:
         if min(self.points, self.keyframes, self.between) < 1:

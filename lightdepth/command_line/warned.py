@@ -1,0 +1,27 @@
+"""Warnings on the command line: a sentence each, without the place in the code that Python shows with them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def warnings_as_sentences() -> Iterator[None]:
+    """Within it a UserWarning is printed as `warning: ` and what it says, on one line. Which ones are shown, and who
+    records them, stays as it is; other kinds, such as a library's deprecations, look as they always do."""
+    as_python = warnings.formatwarning
+
+    def formatted(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+    ) -> str:
+        if not issubclass(category, UserWarning):
+            return as_python(message, category, filename, lineno, line)
+        return f"warning: {' '.join(str(message).split())}\n"
+
+    warnings.formatwarning = formatted
+    try:
+        yield
+    finally:
+        warnings.formatwarning = as_python
