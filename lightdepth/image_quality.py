@@ -4,6 +4,10 @@ All are taken where tissue shows, on 8-bit values. Sharpness is the deviation of
 at no more than 640 columns, so that neither exposure nor sensor noise passes for detail. Combing compares rows with
 their neighbours and with those of their own field: in interlaced pictures of a moving scene the next row but one is
 more alike than the next.
+
+A frame that repeats the one before differs from it by compression or the recorder's noise alone: hardly at all, or far
+less than the frames beside it do (`repeats`). Measured on H.264 of CRF 18 to 28 with noise of up to 4 of 255: repeats
+change by at most 0.72, the others by 2.6 or more where the camera moves by a pixel a frame.
 """
 
 from __future__ import annotations
@@ -15,6 +19,13 @@ import numpy as np
 
 COLUMNS = 640
 THUMBNAIL = 64
+SAME = 0.1
+"""Mean difference of thumbnails, of 255, up to which a frame is the one before again."""
+COMBED = 1.1
+"""Combing from which a frame that moves is interlaced."""
+_MOVING = 1.0  # change, of 255, from which a frame surely moves
+_SHORT = 4  # repeats in a row, up to which they are doubles
+_REPEATED, _BESIDE = 0.25, 4  # of the change of frames beside it, so many on each side, up to which a frame repeats
 WHITE, BLACK = 250, 16
 
 
@@ -41,6 +52,43 @@ class Measures:
     def readable(self) -> np.ndarray:
         result: np.ndarray = np.isfinite(self.brightness)
         return result
+
+
+def repeats(change: np.ndarray) -> np.ndarray:
+    """(n,) bool: which frames repeat the one before, by the change (n,) of each from the one before it."""
+    known = np.where(np.isfinite(change), change, 0.0)
+    padded = np.pad(known, _BESIDE)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, _BESIDE)
+    before, after = windows[: len(known)].max(1), windows[_BESIDE + 1 :].max(1)
+    # Moving frames on both sides: a camera that slows down repeats nothing.
+    beside = np.minimum(before, np.where(np.arange(len(known)) + 1 < len(known), after, before))
+    less = (change < _MOVING) & (change < _REPEATED * beside)
+    result: np.ndarray = np.isfinite(change) & ((change <= SAME) | less)
+    return result
+
+
+def doubles(change: np.ndarray) -> np.ndarray:
+    """(n,) bool: the frames that repeat the one before singly or by a few, as where a lower rate was saved at a higher
+    one; a picture that stands for longer is frozen."""
+    again = repeats(change)
+    result: np.ndarray = again & (_run_lengths(again) <= _SHORT)
+    return result
+
+
+def _run_lengths(which: np.ndarray) -> np.ndarray:
+    """(n,) the length of the run of True that each True of `which` (n,) is in; 0 of False."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], which.astype(int), [0]])))
+    lengths = np.zeros(len(which), int)
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        lengths[start:end] = end - start
+    return lengths
+
+
+def combed(measures: Measures) -> tuple[int, int]:
+    """How many of the frames that move are interlaced, and how many move. Where nothing moves it cannot be seen, and
+    does no harm."""
+    moving = measures.readable & np.isfinite(measures.change) & (measures.change > _MOVING)
+    return int((measures.combing[moving] > COMBED).sum()), int(moving.sum())
 
 
 class Meter:
