@@ -230,7 +230,8 @@ def _decoded(data: bytes, header: DicomHeader, where: str) -> np.ndarray:
         decoder = get_decoder(header.syntax)
         if not decoder.is_available:
             raise InputError(
-                where, f"DICOM in {header.syntax_name}, for which no decoder is installed",
+                where,
+                f"DICOM in {header.syntax_name}, for which no decoder is installed",
                 f"pip install pylibjpeg pylibjpeg-libjpeg, or {_CONVERT}",
             )
         pixels, _ = decoder.as_array(

@@ -114,9 +114,7 @@ def items_of(stream: BinaryIO, start: int, size: int, path: Path) -> tuple[list[
     return offsets or [], items
 
 
-def frames_in_items(
-    stream: BinaryIO, offsets: list[int], items: list[Part], announced: int
-) -> list[tuple[Part, ...]]:
+def frames_in_items(stream: BinaryIO, offsets: list[int], items: list[Part], announced: int) -> list[tuple[Part, ...]]:
     """Which items make which frame: one each where their numbers agree; else by the table, else by what they begin
     with."""
     if announced == 1:

@@ -71,9 +71,9 @@ class VideoFile:
 
     `times` (n,) [s], NaN where the file does not tell; `missing` frames at the end are announced by the file's header
     and not in it; `keyframes` are indices that are quick to reach; `tags` name the metadata that may tell a patient;
-    `rotation` is by how many degrees players are asked to turn the pictures, `interlaced` what the first one says.
-    `content` opens the video where it is a part of the file alone; `bit_depth` says which samples of more than 8 bits
-    are white, where that is not the highest of their type.
+    `timed`: pictures have times of their own; `rotation` is by how many degrees players are asked to turn them,
+    `interlaced` what the first one says. `content` opens the video where it is a part of the file alone; `bit_depth`
+    says which samples of more than 8 bits are white, where that is not the highest of their type.
     """
 
     def __init__(self, path: str | Path, bit_depth: int | None = None, content: Callable[[], BinaryIO] | None = None):
@@ -106,6 +106,7 @@ class VideoFile:
         self.white = white_level(self.bits, bit_depth)
         self.height, self.width = self._pixels(first).shape[:2]
         times = self._times(stamps, time_base)
+        self.timed = self._index.by_time
         self.times = np.array(times + [np.nan] * self.missing)
 
     def __len__(self) -> int:

@@ -14,6 +14,7 @@ from lightdepth.camera import CameraModel
 from lightdepth.datasets import endomapper
 from lightdepth.datasets.clip import Clip, check_depth
 from lightdepth.datasets.clip_checks import check_clip
+from lightdepth.datasets.dicom import is_dicom, open_dicom
 from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask
 from lightdepth.datasets.video import VideoFile
 from lightdepth.datasets.video_calibration import VideoCalibration, found_calibration
@@ -48,20 +49,25 @@ VIDEO_SUFFIXES = (
 
 def open_clip(path: Path, bit_depth: int | None = None) -> Clip:
     """The pictures of a video. Raises InputError where it cannot be read."""
-    return VideoFile(path, bit_depth)
+    return open_dicom(path, bit_depth) if is_dicom(path) else VideoFile(path, bit_depth)
 
 
 def video_at(path: Path) -> Path | None:
     """The video that a path means: the file itself, or the only one in a folder without images, such as EndoMapper's
     Seq_NNN. None where there is none; InputError where there are several."""
     if path.is_file():
-        return path if path.suffix.lower() in VIDEO_SUFFIXES else None
+        return path if _is_video(path) else None
     if not path.is_dir() or list_images(path) or list_images(endomapper.image_folder(path)):
         return None
-    videos = sorted(file for file in path.iterdir() if file.is_file() and file.suffix.lower() in VIDEO_SUFFIXES)
+    videos = sorted(file for file in path.iterdir() if file.is_file() and _is_video(file))
     if len(videos) > 1:
-        raise InputError(path, f"{len(videos)} videos ({', '.join(v.name for v in videos)})", "give one of them")
+        names = ", ".join(v.name for v in videos[:4]) + (f" and {len(videos) - 4} more" if len(videos) > 4 else "")
+        raise InputError(path, f"{len(videos)} videos ({names})", "give one of them")
     return videos[0] if videos else None
+
+
+def _is_video(file: Path) -> bool:
+    return not file.name.startswith(".") and (file.suffix.lower() in VIDEO_SUFFIXES or is_dicom(file))
 
 
 def read_video(
