@@ -13,7 +13,7 @@ import logging
 import os
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ _ELEMENTS = (
     *("FrameIncrementPointer", "FrameTime", "FrameTimeVector", "CineRate", "RecommendedDisplayFrameRate"),
 )
 _COLOURS = ("RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT")
+_OTHERS = ("PALETTE COLOR", "HSV", "ARGB", "CMYK", "YBR_PARTIAL_422", "YBR_PARTIAL_420")
 _GREYS = ("MONOCHROME1", "MONOCHROME2")
 _NATIVE = {"1.2.840.10008.1.2": True, "1.2.840.10008.1.2.1": False}  # whether the VR is implicit
 _COMPRESSED = "1.2.840.10008.1.2.4."
@@ -143,7 +144,7 @@ def read_header(path: Path) -> DicomHeader:
             raise InputError(path, f"DICOM in the transfer syntax {name}", _CONVERT)
         stream.seek(0)
         data = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=list(_ELEMENTS))
-        said = {element: data.get(element) for element in _ELEMENTS}
+        said = {element: _value(data, element) for element in _ELEMENTS}
         start, length = pixel_element(stream, _NATIVE.get(syntax, False), path)
     announced = _whole(said, "NumberOfFrames", path, 1)
     return _checked(path, syntax, name, said, start, length, size, max(1, announced))
@@ -160,9 +161,9 @@ def _checked(
         raise InputError(path, f"DICOM pictures of {width}x{height}", f"expected up to {_MOST_PIXELS} pixels")
     if not video:
         if (colours not in _COLOURS or samples != 3) and (colours not in _GREYS or samples != 1):
-            known = colours if colours.replace("_", "").replace(" ", "").isalnum() and len(colours) < 20 else "unknown"
+            known = colours if colours in (*_COLOURS, *_GREYS, *_OTHERS) else "of another kind"  # or a name, astray
             raise InputError(
-                path, f"DICOM colours {known} of {samples} channels", "expected RGB, YBR or grey: export it as one"
+                path, f"DICOM colours {known}, of {samples} channels", "expected RGB, YBR or grey: export it as one"
             )
         if allocated not in (8, 16) or not 1 < stored <= allocated or _whole(said, "PixelRepresentation", path, 0):
             raise InputError(
@@ -215,9 +216,7 @@ def _frames(
 
 def _decoded(data: bytes, header: DicomHeader, where: str) -> np.ndarray:
     """(H, W, 3) RGB of one frame's bytes."""
-    from pydicom.encaps import encapsulate
-    from pydicom.pixels import get_decoder
-
+    pydicom = _pydicom(where)
     if header.syntax not in _NATIVE:
         inside = header_in(data) if header.syntax != _RLE else None
         if inside is not None and (inside.width, inside.height) != (header.width, header.height):
@@ -227,7 +226,7 @@ def _decoded(data: bytes, header: DicomHeader, where: str) -> np.ndarray:
                 "copy it again, or export it anew",
             )
     with _private(where, "does not decode"):
-        decoder = get_decoder(header.syntax)
+        decoder = pydicom.pixels.get_decoder(header.syntax)
         if not decoder.is_available:
             raise InputError(
                 where,
@@ -235,7 +234,7 @@ def _decoded(data: bytes, header: DicomHeader, where: str) -> np.ndarray:
                 f"pip install pylibjpeg pylibjpeg-libjpeg, or {_CONVERT}",
             )
         pixels, _ = decoder.as_array(
-            data if header.syntax in _NATIVE else encapsulate([data]),
+            data if header.syntax in _NATIVE else pydicom.encaps.encapsulate([data]),
             index=0,
             rows=header.height,
             columns=header.width,
@@ -275,14 +274,11 @@ def _times(said: dict[str, Any], count: int, path: Path) -> np.ndarray | None:
         warnings.warn(
             f"{path}: the header's FrameTimeVector does not fit {count} frames: it is left aside", stacklevel=7
         )
-    for element, step in (
-        ("FrameTime", lambda value: value / 1000),
-        ("CineRate", lambda value: 1 / value),
-        ("RecommendedDisplayFrameRate", lambda value: 1 / value),
-    ):
+    for element in ("FrameTime", "CineRate", "RecommendedDisplayFrameRate"):
         value = _numbers(said[element])
         if len(value) == 1 and 0 < value[0] < 1e5:
-            return np.asarray(step(float(value[0])) * np.arange(count))
+            step = float(value[0]) / 1000 if element == "FrameTime" else 1 / float(value[0])
+            return np.asarray(step * np.arange(count))
     return None
 
 
@@ -295,6 +291,13 @@ def _numbers(value: Any) -> np.ndarray:
     return numbers if np.isfinite(numbers).all() else np.zeros(0)
 
 
+def _value(data: Any, element: str) -> Any:
+    """What the header says of one thing; None where that is broken, which matters for some things alone."""
+    with suppress(Exception):
+        return data.get(element)
+    return None
+
+
 def _whole(said: dict[str, Any], element: str, path: Path, otherwise: int | None = None) -> int:
     value = _numbers(said[element])
     if len(value) != 1 or value[0] != int(value[0]) or value[0] < 0:
@@ -304,12 +307,14 @@ def _whole(said: dict[str, Any], element: str, path: Path, otherwise: int | None
     return int(value[0])
 
 
-def _pydicom(path: Path) -> Any:
+def _pydicom(where: str | Path) -> Any:
     try:
         import pydicom
+        import pydicom.encaps
+        import pydicom.pixels
     except ImportError as error:
         raise InputError(
-            path, "a DICOM file, and pydicom is not installed", "install it: pip install 'lightdepth[dicom]'"
+            where, "a DICOM file, and pydicom is not installed", "install it: pip install 'lightdepth[dicom]'"
         ) from error
     return pydicom
 

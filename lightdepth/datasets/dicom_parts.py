@@ -10,7 +10,7 @@ import io
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from lightdepth.errors import InputError
 
@@ -56,7 +56,7 @@ class _Stream(io.RawIOBase):
         self._at = max(0, offset + (0, self._at, self._size)[whence])
         return self._at
 
-    def readinto(self, buffer) -> int:  # type: ignore[no-untyped-def,override]  # any writable buffer
+    def readinto(self, buffer: Any) -> int:
         before = 0
         for position, length in self._parts:
             if self._at < before + length:
