@@ -51,10 +51,14 @@ def test_pictures_of_every_kind_are_those_that_were_written(folder, kind):
         assert off.mean() < LOSSY.get(kind, 2.1e-3 if "grey" in kind else 1e-9)
 
 
-@pytest.mark.parametrize("name", ["clip.dcm", "1.2.840.10008.42", "IM000001"])
-def test_the_command_line_takes_them_by_ending_or_mark(folder, name):
+@pytest.mark.parametrize("name", ["clip.dcm", "CLIP.DCM", "1.2.840.10008.42", "IM000001"])
+def test_they_are_found_by_ending_or_mark(folder, name):
     path = write_dicom(folder / name, images())
     assert video_at(path) == path and video_at(folder) == path
+
+
+def test_the_command_line_makes_of_them_what_it_makes_of_the_same_pictures_in_a_video(folder):
+    path = write_dicom(folder / "IM000001", images())
     found = predicted(path, folder / "out")
     lossless = write_video(folder / "a.mkv", images(), np.arange(COUNT) / 25, "ffv1", "bgr0")
     expected = predicted(lossless, folder / "expected")
@@ -88,7 +92,7 @@ def test_a_vector_of_times_of_another_length_is_left_aside_and_said(folder):
 
 @pytest.mark.parametrize("kind", ["native RGB", "JPEG", "video"])
 def test_nothing_that_tells_the_patient_is_kept(folder, tmp_path_factory, capsys, kind):
-    count = 12
+    count = 6
     if kind == "video":
         inner = write_video(folder / "inner.mp4", images(count), np.arange(count) / 25, tags={"title": CANARY})
         path = write_dicom_video(folder / f"{CANARY}.dcm", inner, (208, 256), count)
@@ -97,16 +101,16 @@ def test_nothing_that_tells_the_patient_is_kept(folder, tmp_path_factory, capsys
         path = write_dicom(folder / f"{CANARY}.dcm", images(count), kind)
     assert path.read_bytes().count(CANARY.encode()) >= 15
     out = tmp_path_factory.mktemp("out")
-    options = ["--every", "1", "--blur", "0"]
+    options = ["--every", "1", "--blur", "0", "--find_text", "false"]
     assert main(["import", str(path), "-o", str(out / "kept"), *options]) == 0
     assert main(["import", str(path), "-o", str(out / "mailed"), "--no-frames", *options]) == 0
     assert len(open_sequence(out / "kept")) == count
-    plain = folder / "plain.dcm"
-    path.rename(plain)  # a name of the user's own choice may be in run.json of other verbs
-    assert main(["predict", str(plain), "-o", str(out / "predicted"), "--checkpoint", "decline"]) == 0
-    assert main(["select", str(plain), "-o", str(out / "list.txt")]) == 0
+    if kind == "JPEG":
+        plain = path.rename(folder / "plain.dcm")  # a name of the user's own choice may be in run.json of other verbs
+        assert main(["predict", str(plain), "-o", str(out / "predicted"), "--checkpoint", "decline"]) == 0
+        assert main(["select", str(plain), "-o", str(out / "list.txt")]) == 0
     written = [f for f in out.rglob("*") if f.is_file()]
-    assert len(written) > 2 * count
+    assert len(written) > count
     for file in written:
         everything = (str(file.relative_to(out)).encode() + file.read_bytes()).lower()
         for secret in (
