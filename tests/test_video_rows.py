@@ -137,6 +137,8 @@ def test_progressive_video_that_is_flagged_as_interlaced_is_said_to_be_whole(tmp
     video = filmed(tmp_path, [picture(i) for i in range(COUNT)], codec="libx264", pixels="yuv420p", flags="+ilme+ildct")
     with pytest.warns(UserWarning, match="says that its pictures are interlaced, and none of [0-9]+ moving frames"):
         open_sequence(video)
+    said = findings(imported(video, tmp_path / "out"))
+    assert "those that move are whole" in said and "are interlaced:" not in said
 
 
 # ---- turned pictures
