@@ -202,6 +202,15 @@ def test_what_is_no_video_is_refused_by_name(tmp_path, content):
         open_sequence(tmp_path / "a.mp4")
 
 
+def test_metadata_that_is_no_text_and_a_codec_that_nobody_knows_are_no_crash(videos, tmp_path):
+    data = videos["mp4"].read_bytes()
+    (tmp_path / "a.mp4").write_bytes(data.replace(b"iso2avc1", b"iso2av\xd21"))
+    np.testing.assert_array_equal(VideoFile(tmp_path / "a.mp4").read(3), VideoFile(videos["mp4"]).read(3))
+    (tmp_path / "b.mp4").write_bytes(data.replace(b"avc1", b"zzz1"))
+    with refused(where="b.mp4", found="a codec that FFmpeg does not know"):
+        VideoFile(tmp_path / "b.mp4")
+
+
 def test_a_file_that_is_neither_video_nor_folder_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("notes")
     with refused(where="notes.txt", found="is a file"):

@@ -187,7 +187,8 @@ class VideoFile:
     def _opened(self) -> tuple[Any, Any]:
         whole = str(self.path) if self._content is None else self._content()
         try:
-            container = av.open(whole, options={"format_whitelist": _FORMATS, "protocol_whitelist": "file"})
+            options = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
+            container = av.open(whole, options=options, metadata_errors="replace")  # which need not be UTF-8
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(
                 self.path,
@@ -198,6 +199,11 @@ class VideoFile:
             container.close()
             raise InputError(self.path, "no pictures in it", "expected a video")
         stream = container.streams.video[0]
+        if stream.codec_context is None:
+            container.close()
+            raise InputError(
+                self.path, "a video in a codec that FFmpeg does not know, or damaged", "convert it to .mp4, with H.264"
+            )
         # A process that is forked while a decoder has threads, as a DataLoader's workers are, hangs when it frees it.
         stream.thread_type, stream.codec_context.thread_count = "NONE", 1
         return container, stream
@@ -230,7 +236,14 @@ class VideoFile:
         return [i / self.rate if self.rate else float("nan") for i in range(len(self._index.pts))]
 
     def _pixels(self, frame: Any) -> np.ndarray:
-        pixels = frame.to_ndarray(format="rgb48le" if self.bits > 8 else "rgb24", threads=1)
+        try:
+            pixels = frame.to_ndarray(format="rgb48le" if self.bits > 8 else "rgb24", threads=1)
+        except (av.error.FFmpegError, ValueError, MemoryError) as error:
+            raise InputError(
+                self.path,
+                f"{frame.format.name} pictures that become no RGB ({error})",
+                "convert it to .mp4, with H.264",
+            ) from error
         return brightened(pixels, self.white, str(self.path))
 
 
