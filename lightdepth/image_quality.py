@@ -4,6 +4,11 @@ All are taken where tissue shows, on 8-bit values. Sharpness is the deviation of
 at no more than 640 columns, so that neither exposure nor sensor noise passes for detail. Combing compares rows with
 their neighbours and with those of their own field: in interlaced pictures of a moving scene the next row but one is
 more alike than the next.
+
+A frame that repeats the one before differs from it by compression or the recorder's noise alone: hardly at all, or far
+less than the frames beside it do. Measured on H.264 of CRF 18 to 28 with noise of up to 4 of 255: repeats change by at
+most 0.7 (1.5 where a keyframe of the stream codes them anew), the others by 2.6 or more where the camera moves by a
+pixel a frame.
 """
 
 from __future__ import annotations
@@ -15,6 +20,14 @@ import numpy as np
 
 COLUMNS = 640
 THUMBNAIL = 64
+SAME = 0.1
+"""Mean difference of thumbnails, of 255, up to which a frame is the one before again."""
+COMBED = 1.1
+"""Combing from which a frame that moves is interlaced."""
+_MOVING = 1.0  # change, of 255, from which a frame surely moves
+_SHORT = 4  # repeats in a row, up to which they are doubles
+_STILL = 2.0  # change, of 255, up to which a frame may repeat: a repeat that is coded anew changes by 1.5
+_REPEATED = 0.25  # of the change of the frames beside it, up to which a frame repeats
 WHITE, BLACK = 250, 16
 
 
@@ -41,6 +54,68 @@ class Measures:
     def readable(self) -> np.ndarray:
         result: np.ndarray = np.isfinite(self.brightness)
         return result
+
+
+def repeats(change: np.ndarray) -> np.ndarray:
+    """(n,) bool: which frames repeat the one before, by the change (n,) of each from the one before it."""
+    result: np.ndarray = (change <= SAME) | _dips(change)
+    return result
+
+
+def doubles(change: np.ndarray) -> np.ndarray:
+    """(n,) bool: the frames that repeat the one before singly or by a few, as where a lower rate was saved at a higher
+    one; a picture that stands for longer is frozen."""
+    again = repeats(change)
+    result: np.ndarray = _dips(change) | (again & (_run_lengths(again) <= _SHORT))
+    return result
+
+
+def _dips(change: np.ndarray) -> np.ndarray:
+    """(n,) bool: frames of short runs that change far less than the frames just before and after the run: a camera that
+    slows down does so by degrees. There may be nothing before or after, not both."""
+    count = len(change)
+    padded = np.pad(change.astype(np.float64), _SHORT + 1, constant_values=np.inf)
+    found = np.zeros(len(padded), bool)
+    for length in range(1, _SHORT + 1):
+        runs = np.lib.stride_tricks.sliding_window_view(padded, length + 2)
+        inside, beside = runs[:, 1:-1].max(1), np.minimum(runs[:, 0], runs[:, -1])
+        starts = np.flatnonzero((inside < _STILL) & np.isfinite(beside) & (inside < _REPEATED * beside))
+        for k in range(1, length + 1):
+            found[starts + k] = True
+    return found[_SHORT + 1 : _SHORT + 1 + count]
+
+
+class RepeatFinder:
+    """Tells of frames that come one after the other which repeat the one before, without a look at what follows."""
+
+    def __init__(self) -> None:
+        self._before: np.ndarray | None = None
+        self._changes: list[float] = []
+
+    def again(self, pixels: np.ndarray) -> bool:
+        """Whether the next frame (H, W, 3), in [0, 1], repeats the one before."""
+        grey = cv2.cvtColor(np.rint(255 * pixels).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+        thumb = cv2.resize(grey, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
+        change = np.inf if self._before is None else _mean(cv2.absdiff(thumb, self._before))
+        self._before = thumb
+        self._changes = [*self._changes[-_SHORT - 1 :], change]
+        return bool(repeats(np.array(self._changes))[-1])
+
+
+def _run_lengths(which: np.ndarray) -> np.ndarray:
+    """(n,) the length of the run of True that each True of `which` (n,) is in; 0 of False."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], which.astype(int), [0]])))
+    lengths = np.zeros(len(which), int)
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        lengths[start:end] = end - start
+    return lengths
+
+
+def combed(measures: Measures) -> tuple[int, int]:
+    """How many of the frames that move are interlaced, and how many move. Where nothing moves it cannot be seen, and
+    does no harm."""
+    moving = measures.readable & np.isfinite(measures.change) & (measures.change > _MOVING)
+    return int((measures.combing[moving] > COMBED).sum()), int(moving.sum())
 
 
 class Meter:

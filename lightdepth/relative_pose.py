@@ -131,7 +131,7 @@ def _there_and_back(look: Look, other: Look, pixels: np.ndarray, expected: np.nd
     start, guess = ((p - 0.5).astype(np.float32)[:, None] for p in (pixels, expected))
     found, forth = _followed(*images, start, guess)
     again, back = _followed(*images[::-1], found, start)
-    kept = forth & back & (np.linalg.norm(again - start, axis=2)[:, 0] < _THERE_AND_BACK)
+    kept: np.ndarray = forth & back & (np.linalg.norm(again - start, axis=2)[:, 0] < _THERE_AND_BACK)
     return found[:, 0].astype(float) + 0.5, kept
 
 

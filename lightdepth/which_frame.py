@@ -20,6 +20,8 @@ from lightdepth.errors import InputError
 MAX_FRAME = 10**8
 """A month of video; a time of day in seconds or nanoseconds lies above."""
 _FOREIGN = 1e7  # seconds, from which times count from no video's beginning
+_BETWEEN, _ON_STAMP = 0.1, 0.05
+"""Parts of a frame: from the first on, times fall between frames (median); up to the second, on a stamp (all)."""
 _SUFFIX = re.compile(r"\.[A-Za-z]\w*$")
 # A decimal number is a time where a unit says so, where it is all of the name or follows a separator, or where it
 # counts from 1970; `shot1.0001` and `shot_01.0001` are counters behind a point, `frame_0.0333` is none.
@@ -161,7 +163,7 @@ class Clock:
                 'give --map-fps, the frames per second of the video, or put {"fps": ...} into densify_map.json beside '
                 "it, to count frames by time; or write frame numbers as times",
             )
-        if stamped and self._stamps_tell(times):
+        if stamped and (self._stamps_tell(times) or self._counts_nothing(times, where)):
             return self._by_stamp(times, where, begun)
         assert self.fps is not None
         offset = self._offset(times, where, begun, 0.0)
@@ -194,6 +196,20 @@ class Clock:
         assert self.frames is not None
         same_clock = self.frames.known[1][0] > _FOREIGN and times.min() > _FOREIGN and self.time_offset is None
         return bool(self.fps is None or same_clock or self.frames.numbered_by_time)
+
+    def _counts_nothing(self, times: np.ndarray, where: Path | str) -> bool:
+        """Whether times at the rate fall between frames, and on the frames' own stamps: those of a varying rate."""
+        assert self.frames is not None and self.fps is not None
+        shown = times - (self.time_offset or 0.0)
+        between = np.abs(shown * self.fps - np.rint(shown * self.fps))
+        if np.median(between) < _BETWEEN or (self.frames.nearest(shown)[1] > _ON_STAMP * self.frames.step).any():
+            return False
+        warnings.warn(
+            f"{where}: times fall on the stamps of the frames, and between frames where they are counted at "
+            f"{self.fps:g} a second: the stamps are used, as the frame rate varies",
+            stacklevel=2,
+        )
+        return True
 
     def _counted(self, counted: np.ndarray, times: np.ndarray, where: Path | str) -> list[str]:
         numbers = np.rint(counted)

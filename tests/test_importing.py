@@ -21,7 +21,7 @@ from lightdepth.datasets.sequence import border_mask
 from lightdepth.frame import Frame
 from lightdepth.image_quality import Measures, Meter, one_field
 from lightdepth.importing.overlay import find_overlay
-from lightdepth.importing.selection import BLURRED, FROZEN, KEPT, PASSED, UNREADABLE, Choice, selected
+from lightdepth.importing.selection import BLURRED, DOUBLE, KEPT, PASSED, UNREADABLE, Choice, selected
 from lightdepth.models import DeclineModel, predict
 
 import_frames = by_options(import_frames_verb)
@@ -270,7 +270,7 @@ def test_frames_are_chosen_by_time_and_what_is_blurred_frozen_or_unreadable_is_n
         brightness=[120, 120, 120, 120, 120, 120, 120, 120, np.nan],
     )
     fate = selected(times, found, Choice(rate=2))
-    assert fate.tolist() == [PASSED, KEPT, PASSED, BLURRED, KEPT, KEPT, FROZEN, KEPT, UNREADABLE]
+    assert fate.tolist() == [PASSED, KEPT, PASSED, BLURRED, KEPT, KEPT, DOUBLE, KEPT, UNREADABLE]
     assert (selected(times, found, Choice(blur=0)) == KEPT).sum() == 7
     assert np.flatnonzero(selected(times, found, Choice(every=2, blur=0)) == KEPT).tolist() == [0, 2, 4]
     assert (selected(times, found, Choice(max_frames=3)) == KEPT).sum() == 3

@@ -202,6 +202,15 @@ def test_what_is_no_video_is_refused_by_name(tmp_path, content):
         open_sequence(tmp_path / "a.mp4")
 
 
+def test_metadata_that_is_no_text_and_a_codec_that_nobody_knows_are_no_crash(videos, tmp_path):
+    data = videos["mp4"].read_bytes()
+    (tmp_path / "a.mp4").write_bytes(data.replace(b"iso2avc1", b"iso2av\xd21"))
+    np.testing.assert_array_equal(VideoFile(tmp_path / "a.mp4").read(3), VideoFile(videos["mp4"]).read(3))
+    (tmp_path / "b.mp4").write_bytes(data.replace(b"avc1", b"zzz1"))
+    with refused(where="b.mp4", found="a codec that FFmpeg does not know"):
+        VideoFile(tmp_path / "b.mp4")
+
+
 def test_a_file_that_is_neither_video_nor_folder_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("notes")
     with refused(where="notes.txt", found="is a file"):
@@ -212,17 +221,28 @@ def test_a_file_that_is_neither_video_nor_folder_is_refused(tmp_path):
         open_sequence(tmp_path, "video")
 
 
-def test_pictures_are_turned_as_the_file_says(videos, tmp_path):
+def turned_by_flag(video: Path, path: Path) -> Path:
     """The matrix of an mp4's track header, set to a quarter turn as telephones do."""
-    data = bytearray(videos["mp4"].read_bytes())
+    data = bytearray(video.read_bytes())
     upright = b"".join(v.to_bytes(4, "big") for v in (1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30))
     turned = b"".join((v % 2**32).to_bytes(4, "big") for v in (0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30))
     at = data.find(upright, data.find(b"tkhd"))
     data[at : at + len(turned)] = turned
-    (tmp_path / "turned.mp4").write_bytes(data)
-    video = VideoFile(tmp_path / "turned.mp4")
-    assert (video.width, video.height) == (208, 256) and video.rotation in (90, 270)
-    np.testing.assert_array_equal(video.read(4), np.rot90(VideoFile(videos["mp4"]).read(4), -1))  # clockwise
+    path.write_bytes(data)
+    return path
+
+
+def test_pixels_are_the_stored_ones_whatever_turn_the_file_asks_for(videos, tmp_path):
+    path = turned_by_flag(videos["mp4"], tmp_path / "turned.mp4")
+    video = VideoFile(path)
+    assert (video.width, video.height) == (256, 208) and video.rotation in (90, 270)
+    np.testing.assert_array_equal(video.read(4), VideoFile(videos["mp4"]).read(4))
+    write_camera(CAMERA, tmp_path / "camera.json")
+    with pytest.warns(UserWarning, match="a flag asks players to turn the pictures by [0-9]+ degrees; it is left"):
+        assert open_sequence(path)[4].image.shape == (208, 256, 3)
+    write_camera(CAMERA.resized(256, 208).cropped(0, 0, 208, 256), tmp_path / "turned.json")
+    with refused(found="the calibration is of the turned 208x256", cure="turn the pixels for good"):
+        open_sequence(path, camera=tmp_path / "turned.json")
 
 
 def test_odd_sizes_and_pixel_formats_are_rgb(tmp_path):

@@ -48,7 +48,7 @@ def write_video(
     tags: dict[str, str] | None = None,
     **options: str,
 ) -> Path:
-    """RGB images (H, W, 3) uint8 at times [s] as a video; its type follows from the suffix."""
+    """RGB images (H, W, 3) uint8, or grey (H, W) uint16, at times [s] as a video; its type follows from the suffix."""
     muxing = {"movflags": "faststart"} if path.suffix in (".mp4", ".mov") else {}
     with av.open(str(path), "w", options=muxing) as container:
         container.metadata.update(tags or {})
@@ -57,7 +57,7 @@ def write_video(
         stream.pix_fmt, stream.options = pixels, {"g": "12", **options}
         stream.codec_context.time_base = stream.time_base = TIME_BASE
         for image, time in zip(images, times, strict=True):
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24" if image.ndim == 3 else "gray16le")
             frame.pts, frame.time_base = round(time / TIME_BASE), TIME_BASE
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))

@@ -11,7 +11,8 @@ from lightdepth.datasets.scared_writing import write_scared
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.datasets.simcol import read_simcol, write_simcol
 from lightdepth.datasets.source import SequenceSource
-from lightdepth.datasets.video import VideoFile, read_video
+from lightdepth.datasets.video import VideoFile
+from lightdepth.datasets.video_sequence import read_video
 
 __all__ = [
     "FORMATS",

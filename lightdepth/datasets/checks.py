@@ -57,7 +57,7 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
         *_truth_doubts(frames),
         *_unit_doubts(frames),
         *_level_doubts(frames),
-        *_comb_doubts(frames),
+        *([] if sequence.combs_said else _comb_doubts(frames)),
     ):
         warnings.warn(f"{sequence.source}: {message}", stacklevel=3)
     check_shown(sequence, frames)
@@ -214,7 +214,7 @@ def _comb_doubts(frames: Sequence[Frame]) -> list[str]:
         return []
     return [
         f"the images look interlaced (neighbouring rows differ {ratio:.2f} times as much as rows of one field): "
-        "deinterlace the video, or keep every second row and halve the width"
+        "deinterlace the video: lightdepth import --deinterlace keeps one field, and the camera stays right"
     ]
 
 

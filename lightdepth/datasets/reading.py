@@ -14,7 +14,7 @@ from lightdepth.datasets import c3vd, endomapper, endoslam, folder, hamlyn, scar
 from lightdepth.datasets.checks import check_sequence
 from lightdepth.datasets.format import Format
 from lightdepth.datasets.sequence import FrameSequence, legible, list_images, no_images, read_mask
-from lightdepth.datasets.video import VideoFile, read_video, video_at
+from lightdepth.datasets.video_sequence import check_turned, open_clip, read_video, video_at
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size
 from lightdepth.frame import check_image_size
@@ -76,7 +76,7 @@ def stamps_of(path: str | Path, format: str | None = None) -> Stamps:
         try:
             video = video_at(path) if format in (None, "video") else None
             if video is not None:
-                times = VideoFile(video).times
+                times = open_clip(video).times
                 return np.arange(len(times)), np.asarray(times, np.float64)
             return folder.stamps(path, list_images(images) if images.is_dir() else [])
         except (InputError, OSError):
@@ -97,7 +97,7 @@ def _open(
     cluster = _is_cluster(path, format)
     video = video_at(path) if format in (None, "video") else None
     if video is not None:
-        return _open_video(video, camera, light, mask, map_camera)
+        return _open_video(video, camera, light, mask, map_camera, bit_depth)
     if not path.is_dir() and not cluster:
         found = "is a file" if path.is_file() else "does not exist"
         raise InputError(path, found, "expected a folder of frames, or a video such as .mp4 or .mov")
@@ -176,16 +176,18 @@ def _open_video(
     light: str | Path | None,
     mask: str | Path | None,
     map_camera: CameraModel | None,
+    bit_depth: int | None,
 ) -> FrameSequence:
     """The frames of a video; a camera's file that holds no size, as intrinsics.txt, is for the video's."""
     chosen = None
     if camera is not None:
-        opened = VideoFile(video)
+        opened = open_clip(video)
         chosen = read_camera(Path(camera), (opened.width, opened.height))
+        check_turned(opened, chosen)
         check_image_size(str(video), opened.width, opened.height, chosen)
     chosen_light = None if light is None else _given(read_light(light))
     chosen_mask = read_mask(Path(mask)) if mask is not None else None
-    return read_video(video, chosen, chosen_light, chosen_mask, map_camera)
+    return read_video(video, chosen, chosen_light, chosen_mask, map_camera, bit_depth)
 
 
 def _at_size_of_images(camera: CameraModel, folder: Path) -> CameraModel:
@@ -204,7 +206,7 @@ def size_of_frames(path: Path, format: str | None = None) -> tuple[int, int]:
     """Width and height of the frames at `path`, a video or a folder, as far as they need no camera."""
     video = video_at(path) if format in (None, "video") and path.exists() else None
     if video is not None:
-        opened = VideoFile(video)
+        opened = open_clip(video)
         return opened.width, opened.height
     if not path.is_dir():
         found = "is a file" if path.is_file() else "does not exist"

@@ -38,7 +38,8 @@ from lightdepth.datasets.folder import image_folder
 from lightdepth.datasets.format import Format, frames_of
 from lightdepth.datasets.scared_files import IMAGES, VIDEO, numbered_members
 from lightdepth.datasets.sequence import FrameSequence, along_ray
-from lightdepth.datasets.video import VideoFile, border_of
+from lightdepth.datasets.video import VideoFile
+from lightdepth.datasets.video_sequence import border_of
 from lightdepth.errors import InputError
 from lightdepth.files.images import decode_raw, image_size, read_raw, unit_range
 from lightdepth.frame import Frame
@@ -124,7 +125,7 @@ def _read_sequence(
         raise InputError(
             video.path, f"{video.width}x{video.height}", "expected the left view above the right, of one height"
         )
-    height, fps = video.height // 2, video.rate or 25.0
+    height, times = video.height // 2, video.times
     data, points = numbered_members(path / "data", *_DATA), numbered_members(path / "data", *_POINTS)
     records = {n: (name, _json(blob, name)) for n, name, blob in data.all()} if data is not None else {}
     if camera is None and not records:
@@ -163,7 +164,7 @@ def _read_sequence(
                 camera,
                 light,
                 mask,
-                time=number / fps,
+                time=float(times[number]) if np.isfinite(times[number]) else None,
                 true_distance=distance,
                 true_world_from_cam=reading(poses[number]) @ np.linalg.inv(view_from_left) if number in poses else None,
             )

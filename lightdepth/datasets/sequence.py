@@ -29,7 +29,8 @@ class FrameSequence(Sequence[Frame]):
     """Frames by index, each read from disk when it is asked for. `names` and `numbers` cost no reading.
 
     `sampled` are the frames by which the sequence is checked when it is opened: first, middle and last where left out.
-    `load_blind` loads a frame without its true distance, where there may be one.
+    `load_blind` loads a frame without its true distance, where there may be one; `combs_said` that interlacing was
+    looked for by the reader, who sees more than single frames.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class FrameSequence(Sequence[Frame]):
         source: str,
         sampled: Sequence[int] | None = None,
         load_blind: Callable[[int], Frame] | None = None,
+        combs_said: bool = False,
     ):
         if not names:
             raise InputError(source, "no frames in it", "expected images with a number in their names")
@@ -47,6 +49,7 @@ class FrameSequence(Sequence[Frame]):
         self.source = source
         self._load = load
         self._load_blind = load_blind
+        self.combs_said = combs_said
         self.sampled = tuple(sorted({0, len(names) // 2, len(names) - 1})) if sampled is None else tuple(sampled)
         twice = {n for n in self.numbers if self.numbers.count(n) > 1} if len(set(self.numbers)) < len(names) else set()
         if twice:

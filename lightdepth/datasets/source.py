@@ -16,7 +16,7 @@ class SequenceSource:
     """Frames, and the files that win over what lies beside them."""
 
     data: Path
-    """Folder of frames, or a video, of any of the formats that --format lists."""
+    """Folder of frames, or a video (a DICOM file too), of any of the formats that --format lists."""
     format: FormatName | None = None
     """Format of the frames: folder (images with camera.json), video, or the data set c3vd, simcol, hamlyn, scared,
     endoslam or endomapper. Left out, it is told by the files."""

@@ -4,8 +4,8 @@ Opening reads the packets once without decoding them: their presentation times, 
 forward from where it is, or from the keyframe before; a decoded picture is known by its own time, so what comes back is
 exact after any jump. Frames that the file lacks or that do not decode are refused by number, the others are given.
 
-Pictures are turned as the file says (90, 180, 270 degrees), and keep 16 bits where the file has more than 8.
-VideoCalibration is looked for beside the file: camera.json, light.json, mask.png, else EndoMapper's, as for its frames.
+Pixels are the stored ones: a flag that asks players to turn the pictures is left aside, as with pictures' EXIF. They
+keep 16 bits where the file has more than 8.
 """
 
 from __future__ import annotations
@@ -13,47 +13,19 @@ from __future__ import annotations
 import os
 import threading
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import av
 import numpy as np
 
-from lightdepth.camera import CameraModel
-from lightdepth.datasets import endomapper
-from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask
-from lightdepth.datasets.video_calibration import VideoCalibration, found_calibration
+from lightdepth.datasets.clip import brightened, white_level
 from lightdepth.errors import InputError
-from lightdepth.files.images import unit_range
-from lightdepth.frame import Frame
-from lightdepth.photometry import PhotometricCalibration
 
-VIDEO_SUFFIXES = (
-    ".mp4",
-    ".mov",
-    ".m4v",
-    ".avi",
-    ".mkv",
-    ".webm",
-    ".mpg",
-    ".mpeg",
-    ".m2v",
-    ".vob",
-    ".ts",
-    ".mts",
-    ".m2ts",
-    ".wmv",
-    ".asf",
-    ".mxf",
-    ".flv",
-    ".mjpeg",
-    ".ogv",
-    ".dv",
-)
 # Formats that hold pictures themselves. Playlists, which name other files or hosts, are not among them.
 _FORMATS = "mov,matroska,avi,mpeg,mpegts,mpegvideo,asf,mxf,flv,mjpeg,ogg,dv,h264,hevc,m4v,nut,ivf,yuv4mpegpipe"
 
@@ -98,11 +70,15 @@ class VideoFile:
     """Pictures of a video by index. One reader at a time decodes; every process opens the file for itself.
 
     `times` (n,) [s], NaN where the file does not tell; `missing` frames at the end are announced by the file's header
-    and not in it; `keyframes` are indices that are quick to reach; `tags` name the metadata that may tell a patient.
+    and not in it; `keyframes` are indices that are quick to reach; `tags` name the metadata that may tell a patient;
+    `timed`: pictures have times of their own; `rotation` is by how many degrees players are asked to turn them,
+    `interlaced` what the first one says. `content` opens the video where it is a part of the file alone; `bit_depth`
+    says which samples of more than 8 bits are white, where that is not the highest of their type.
     """
 
-    def __init__(self, path: str | Path):
+    def __init__(self, path: str | Path, bit_depth: int | None = None, content: Callable[[], BinaryIO] | None = None):
         self.path = Path(path)
+        self._content = content
         self._lock = threading.Lock()
         self._decoder: _Decoder | None = None
         self._last: tuple[int, np.ndarray] | None = None
@@ -127,8 +103,10 @@ class VideoFile:
         self.interlaced = bool(first.interlaced_frame)
         self.rotation = first.rotation % 360
         self.bits = max(component.bits for component in first.format.components)
+        self.white = white_level(self.bits, bit_depth)
         self.height, self.width = self._pixels(first).shape[:2]
         times = self._times(stamps, time_base)
+        self.timed = self._index.by_time
         self.times = np.array(times + [np.nan] * self.missing)
 
     def __len__(self) -> int:
@@ -207,8 +185,10 @@ class VideoFile:
         self._lock = threading.Lock()
 
     def _opened(self) -> tuple[Any, Any]:
+        whole = str(self.path) if self._content is None else self._content()
         try:
-            container = av.open(str(self.path), options={"format_whitelist": _FORMATS, "protocol_whitelist": "file"})
+            options = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
+            container = av.open(whole, options=options, metadata_errors="replace")  # which need not be UTF-8
         except (av.error.FFmpegError, OSError) as error:
             raise InputError(
                 self.path,
@@ -219,6 +199,11 @@ class VideoFile:
             container.close()
             raise InputError(self.path, "no pictures in it", "expected a video")
         stream = container.streams.video[0]
+        if stream.codec_context is None:
+            container.close()
+            raise InputError(
+                self.path, "a video in a codec that FFmpeg does not know, or damaged", "convert it to .mp4, with H.264"
+            )
         # A process that is forked while a decoder has threads, as a DataLoader's workers are, hangs when it frees it.
         stream.thread_type, stream.codec_context.thread_count = "NONE", 1
         return container, stream
@@ -251,91 +236,15 @@ class VideoFile:
         return [i / self.rate if self.rate else float("nan") for i in range(len(self._index.pts))]
 
     def _pixels(self, frame: Any) -> np.ndarray:
-        pixels = frame.to_ndarray(format="rgb48le" if self.bits > 8 else "rgb24", threads=1)
-        return np.ascontiguousarray(np.rot90(pixels, self.rotation // 90)) if self.rotation else pixels
-
-
-def video_at(path: Path) -> Path | None:
-    """The video that a path means: the file itself, or the only one in a folder without images, such as EndoMapper's
-    Seq_NNN. None where there is none; InputError where there are several."""
-    if path.is_file():
-        return path if path.suffix.lower() in VIDEO_SUFFIXES else None
-    if not path.is_dir() or list_images(path) or list_images(endomapper.image_folder(path)):
-        return None
-    videos = sorted(file for file in path.iterdir() if file.is_file() and file.suffix.lower() in VIDEO_SUFFIXES)
-    if len(videos) > 1:
-        raise InputError(path, f"{len(videos)} videos ({', '.join(v.name for v in videos)})", "give one of them")
-    return videos[0] if videos else None
-
-
-def read_video(
-    path: Path,
-    camera: CameraModel | None = None,
-    light: PhotometricCalibration | None = None,
-    mask: np.ndarray | None = None,
-    map_camera: CameraModel | None = None,
-) -> FrameSequence:
-    """Frames of a video file, named 000000, 000001, ... What is given wins over what lies beside the file; `map_camera`
-    serves where there is no camera.json. Without any camera it is refused; without a mask the black border is found."""
-    video = VideoFile(path)
-    if camera is None and map_camera is not None and not (path.parent / "camera.json").is_file():
-        camera = endomapper.at_size(map_camera, video.width, video.height, path.name)
-    if camera is None or light is None or mask is None:
-        found = found_calibration(path, video.width, video.height) if camera is None else _without_camera(path, video)
-        camera, light = camera or found.camera, light or found.light
-        mask = found.mask if mask is None else mask
-    if camera is None:
-        raise InputError(
-            path,
-            "no camera.json beside it",
-            'give --camera FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), '
-            "--camera auto to find it from the motion (--fov 70 where to start), or a map that has one",
-        )
-    if mask is None:
-        mask = border_of(video)
-    names = [f"{i:06d}" for i in range(len(video))]
-    return FrameSequence(names, _Load(video, camera, light or PhotometricCalibration(), mask), str(path))
-
-
-def quick_sample(video: VideoFile, count: int) -> list[int]:
-    """So many frames, spread over a video; keyframes where there are enough of them."""
-    there = video.keyframes if len(video.keyframes) >= count else range(len(video) - video.missing)
-    return [there[i] for i in np.unique(np.linspace(0, len(there) - 1, count).round().astype(int))]
-
-
-def border_of(video: VideoFile, rows: slice = slice(None), count: int = 8) -> np.ndarray:
-    """`border_mask` of these rows of some frames that decode."""
-    images = []
-    for i in [0, *quick_sample(video, count)]:  # the first decodes, or the file would have been refused
         try:
-            images.append(unit_range(video.read(i)[rows]))
-        except InputError:
-            continue  # refused by number when it is asked for
-    return border_mask(images)
-
-
-@dataclass(frozen=True)
-class _Load:
-    """Reads frame i. Can be pickled: every worker opens the file for itself."""
-
-    video: VideoFile
-    camera: CameraModel
-    light: PhotometricCalibration
-    mask: np.ndarray
-
-    def __call__(self, i: int) -> Frame:
-        time = float(self.video.times[i])
-        image = unit_range(self.video.read(i))
-        return Frame(f"{i:06d}", image, self.camera, self.light, self.mask, None if np.isnan(time) else time)
-
-
-def _without_camera(path: Path, video: VideoFile) -> VideoCalibration:
-    """Light and mask beside a video whose camera is given; an endoscope without calibration has neither."""
-    try:
-        return found_calibration(path, video.width, video.height)
-    except InputError:
-        mask = path.parent / "mask.png"
-        return VideoCalibration(mask=read_mask(mask) if mask.is_file() else None)
+            pixels = frame.to_ndarray(format="rgb48le" if self.bits > 8 else "rgb24", threads=1)
+        except (av.error.FFmpegError, ValueError, MemoryError) as error:
+            raise InputError(
+                self.path,
+                f"{frame.format.name} pictures that become no RGB ({error})",
+                "convert it to .mp4, with H.264",
+            ) from error
+        return brightened(pixels, self.white, str(self.path))
 
 
 def _index_of(container: Any, stream: Any) -> tuple[_Index | None, list[int | None]]:

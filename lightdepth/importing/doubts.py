@@ -57,8 +57,15 @@ def doubts(
         )
     if source.video is not None:
         found += _of_video(source)
+        if source.video.interlaced and not deinterlace and not finding.interlaced(scan.measures):
+            found.append(
+                Finding(
+                    "The file says that its pictures are interlaced, and those that move are whole.",
+                    "Nothing, if they look so; --deinterlace keeps one field.",
+                )
+            )
     measured = finding.of_frames(scan.measures, fate, scan.times)
-    return found + [f for f in measured if not (deinterlace and "interlaced" in f.found)]
+    return found + [f for f in measured if not (deinterlace and "are interlaced" in f.found)]
 
 
 def _of_video(source: Source) -> list[Finding]:
@@ -74,8 +81,9 @@ def _of_video(source: Source) -> list[Finding]:
     if video.rotation:
         found.append(
             Finding(
-                f"The file says to show it turned by {video.rotation} degrees; the frames are turned so.",
-                "The calibration must be of the turned picture.",
+                f"The file says to show it turned by {video.rotation} degrees; frames are as stored.",
+                "Right if the calibration, mask and map are of the stored pictures. Players, ffmpeg and OpenCV turn "
+                "them: for a calibration of the turned ones, turn the file for good first (`ffmpeg -i IN OUT`).",
             )
         )
     if abs(video.pixel_aspect - 1) > 0.01:

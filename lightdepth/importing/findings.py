@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lightdepth.image_quality import BLACK, Measures
-from lightdepth.importing.selection import BLURRED, FROZEN, KEPT, UNREADABLE
+from lightdepth.datasets.clip import uneven
+from lightdepth.image_quality import BLACK, Measures, combed
+from lightdepth.importing.selection import BLURRED, DOUBLE, FROZEN, KEPT, UNREADABLE
 
 LOW_RESOLUTION, SMALL_MASK, BLURRED_SHARE, SATURATED_SHARE = 240, 0.3, 0.3, 0.1
-DARK_SHARE, DARK_BRIGHTNESS, JUMP, JUMPS_SHARE, COMBED, VARYING = 0.3, 50.0, 0.15, 0.02, 1.1, 0.05
+DARK_SHARE, DARK_BRIGHTNESS, JUMP, JUMPS_SHARE, COMBED_SHARE = 0.3, 50.0, 0.15, 0.02, 0.2
 
 
 @dataclass(frozen=True)
@@ -52,16 +53,25 @@ def of_frames(measures: Measures, fate: np.ndarray, times: np.ndarray) -> list[F
             Finding(
                 f"{int((fate == FROZEN).sum())} frames ({share(FROZEN):.1%}) repeat the frame before: "
                 f"{_runs(fate == FROZEN)}. They were left out.",
-                "Nothing, if the picture was frozen for a photograph; if it is every second or third frame, the "
-                "recorder ran faster than the endoscope, and the true rate is lower.",
+                "Nothing, if the picture was frozen for a photograph.",
             )
         )
-    combing = float(np.median(measures.combing[known]))
-    if interlaced(measures):
+    if (fate == DOUBLE).any():
         findings.append(
             Finding(
-                f"The pictures are interlaced: neighbouring rows differ more than rows of the same field "
-                f"(ratio {combing:.2f}, its upper decile {np.quantile(measures.combing[known], 0.9):.2f}).",
+                f"{int((fate == DOUBLE).sum())} frames ({share(DOUBLE):.0%}) are doubles: they repeat the frame "
+                "before, singly or by a few, while the camera moves. They were left out.",
+                "Nothing, times stay true. The recorder ran faster than the endoscope: one that counts frames at the "
+                "file's rate, such as a SLAM, counts the doubles too.",
+            )
+        )
+    if interlaced(measures):
+        teeth, moving = combed(measures)
+        findings.append(
+            Finding(
+                f"The pictures are interlaced: neighbouring rows differ more than rows of the same field in "
+                f"{teeth / moving:.0%} of the frames that move (ratio {np.median(measures.combing[known]):.2f}, its "
+                f"upper decile {np.quantile(measures.combing[known], 0.9):.2f}).",
                 "Give --deinterlace: it keeps one field and interpolates the rows between, the camera stays right.",
             )
         )
@@ -107,17 +117,13 @@ def of_frames(measures: Measures, fate: np.ndarray, times: np.ndarray) -> list[F
                 "Check the colours in a picture; leave narrow-band passages out.",
             )
         )
-    known_times = times[np.isfinite(times)]
-    if len(known_times) > 2:
-        steps = np.diff(known_times)
-        if np.ptp(np.quantile(steps, (0.05, 0.95))) > VARYING * np.median(steps) + 1e-3:
-            findings.append(
-                Finding(
-                    f"The frame rate varies: steps of {1000 * np.quantile(steps, 0.05):.0f} to "
-                    f"{1000 * np.quantile(steps, 0.95):.0f} ms.",
-                    "Use the times in times.csv, never number / rate.",
-                )
+    if (steps := uneven(times)) is not None:
+        findings.append(
+            Finding(
+                f"The frame rate varies: steps of {1000 * steps[0]:.0f} to {1000 * steps[1]:.0f} ms.",
+                "Use the times in times.csv, never number / rate.",
             )
+        )
     if not kept:
         findings.append(Finding("No frame was kept.", "Widen --start and --end, or lower --blur."))
     return findings
@@ -125,8 +131,8 @@ def of_frames(measures: Measures, fate: np.ndarray, times: np.ndarray) -> list[F
 
 def interlaced(measures: Measures) -> bool:
     """Whether frames that move are combed. Where nothing moves, interlacing cannot be seen and does no harm."""
-    moving = measures.readable & np.isfinite(measures.change) & (measures.change > 1)
-    return bool(moving.sum() >= 3 and np.median(measures.combing[moving]) > COMBED)
+    teeth, moving = combed(measures)
+    return moving >= 3 and teeth >= COMBED_SHARE * moving
 
 
 def exposure_jumps(measures: Measures) -> int:

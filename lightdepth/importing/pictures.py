@@ -17,7 +17,7 @@ from lightdepth.image_quality import eight_bits, one_field
 from lightdepth.importing.page import Picture
 from lightdepth.importing.regions import Regions
 from lightdepth.importing.scan import Scan
-from lightdepth.importing.selection import BLURRED, FROZEN, KEPT
+from lightdepth.importing.selection import BLURRED, DOUBLE, FROZEN, KEPT
 from lightdepth.importing.source import Source
 from lightdepth.reporting.figures import thumbnail
 from lightdepth.reporting.progress import Progress
@@ -97,7 +97,7 @@ def write_pictures(
 ) -> list[Picture]:
     """The sequence; returns thumbnails for the contact sheet, some of them of frames that were left out."""
     kept = np.flatnonzero(fate == KEPT)
-    left_out = np.flatnonzero(np.isin(fate, (BLURRED, FROZEN)))
+    left_out = np.flatnonzero(np.isin(fate, (BLURRED, DOUBLE, FROZEN)))
     shown = {*kept[_spread(len(kept), _PICTURES)], *left_out[_spread(len(left_out), _EXAMPLES)]}
     (run.folder / "frames").mkdir()
     pictures: list[Picture] = []

@@ -1,4 +1,4 @@
-"""Which frames are kept: by time, the sharpest of each interval, without blurred and frozen ones."""
+"""Which frames are kept: by time, the sharpest of each interval, without blurred, frozen and double ones."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import numpy as np
 from scipy.ndimage import percentile_filter
 
 from lightdepth.errors import InputError
-from lightdepth.image_quality import Measures
+from lightdepth.image_quality import Measures, doubles, repeats
 
-SAME = 0.1
-"""Mean difference of thumbnails, of 255, up to which a frame is the one before again."""
-KEPT, PASSED, BLURRED, FROZEN, UNREADABLE = "kept", "passed over", "blurred", "frozen", "unreadable"
+KEPT, PASSED, BLURRED, UNREADABLE = "kept", "passed over", "blurred", "unreadable"
+FROZEN, DOUBLE = "frozen", "double"
 
 
 @dataclass(frozen=True)
@@ -56,11 +55,13 @@ class Choice:
 
 
 def selected(times: np.ndarray, measures: Measures, choice: Choice) -> np.ndarray:
-    """(n,) what becomes of each frame: kept, passed over, blurred, frozen or unreadable. times (n,) [s] of the frames;
-    where they are unknown, `rate` cannot be used."""
+    """(n,) what becomes of each frame: kept, passed over, blurred, frozen, double or unreadable. times (n,) [s] of the
+    frames; where they are unknown, `rate` cannot be used."""
     fate = np.full(len(times), PASSED, dtype="<U12")
     fate[~measures.readable] = UNREADABLE
-    fate[measures.readable & (measures.change <= SAME)] = FROZEN
+    again = measures.readable & repeats(measures.change)
+    fate[again] = FROZEN
+    fate[again & doubles(measures.change)] = DOUBLE
     left = fate == PASSED
     blurred = left & (measures.sharpness < choice.blur * neighbourhood(measures.sharpness, times))
     fate[blurred] = BLURRED

@@ -11,10 +11,11 @@ import numpy as np
 
 from lightdepth.calibration import read_camera, read_light
 from lightdepth.camera import CameraModel, Pinhole
-from lightdepth.datasets import FrameSequence, SequenceSource, VideoFile
+from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets.clip import Clip, check_depth
 from lightdepth.datasets.sequence import list_images, read_mask
-from lightdepth.datasets.video import quick_sample, video_at
 from lightdepth.datasets.video_calibration import found_calibration
+from lightdepth.datasets.video_sequence import open_clip, quick_sample, spread_pictures, video_at
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8
 from lightdepth.photometry import PhotometricCalibration
@@ -32,7 +33,7 @@ class Source:
     camera: CameraModel | None = None
     light: PhotometricCalibration | None = None
     mask: np.ndarray | None = None
-    video: VideoFile | None = None
+    video: Clip | None = None
     no_camera: str = ""  # why there is none, where more can be said than that
 
     def __len__(self) -> int:
@@ -51,7 +52,9 @@ def open_source(source: SequenceSource) -> tuple[Source, list[Path]]:
     path = source.data
     video = video_at(path) if source.format in (None, "video") else None
     if video is not None:
-        return _of_video(VideoFile(video), source.camera, source.light, source.mask), [video]
+        clip = open_clip(video, source.bit_depth)
+        check_depth(clip, spread_pictures(clip))
+        return _of_video(clip, source.camera, source.light, source.mask), [video]
     if path.is_file():
         raise InputError(
             path,
@@ -88,7 +91,7 @@ def content_hash(files: list[Path]) -> str:
     return digest.hexdigest()
 
 
-def _of_video(video: VideoFile, camera: Path | None, light: str | None, mask: Path | None) -> Source:
+def _of_video(video: Clip, camera: Path | None, light: str | None, mask: Path | None) -> Source:
     why, found = "", None
     try:
         found = found_calibration(video.path, video.width, video.height)

@@ -20,6 +20,7 @@ from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.errors import InputError
 from lightdepth.files.writing import Content, write_together
+from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
 from lightdepth.reporting.progress import Progress
@@ -110,7 +111,9 @@ def select(
         settings = {"matcher": matcher, **asdict(nodes), **asdict(config.sift if matcher == "sift" else config.loftr)}
         how = f"frames matched with {matcher}"
         with Progress("Selecting", len(frames)) as bar:
-            verdicts = select_by_matching(frames, frames.names, OrientationDescriptor(), used, nodes, bar.advance)
+            verdicts = select_by_matching(
+                frames, frames.names, OrientationDescriptor(), used, nodes, bar.advance, RepeatFinder().again
+            )
     if not any(v.kept for v in verdicts):
         raise InputError(
             data,

@@ -25,6 +25,7 @@ from lightdepth.sparse_map import SparseMap, Submap, covisibility
 from .matching import Descriptor, MatchAgreement, Matcher
 
 BLUR, NO_MATCHES, FEW_VIEWS, UNREADABLE = "blur", "no matches", "too few views", "unreadable"
+DOUBLE = "double"
 NOT_IN_MAP, FEW_KEYFRAMES = "not in the map", "too few covisible keyframes"
 
 
@@ -132,6 +133,7 @@ class _Seen:
     similarity: float | None = None
     agreement: MatchAgreement | None = None
     features: int | None = None
+    double: bool = False
 
 
 def select_by_matching(
@@ -141,10 +143,12 @@ def select_by_matching(
     matcher: Matcher,
     rules: NodeRules,
     advance: Callable[[], None] = lambda: None,
+    repeated: Callable[[np.ndarray], bool] = lambda image: False,
 ) -> list[FrameVerdict]:
     """A verdict for every frame, in order. Each frame is read and described once; images are not kept.
 
-    A frame that cannot be read is rejected; raises InputError when none can.
+    A frame that cannot be read is rejected, and so is one whose image repeats the one before (`repeated`): it
+    matches it, and shows nothing new. Raises InputError when none can be read.
     """
     seen: list[_Seen] = []
     views_in: Counter[int] = Counter()
@@ -157,6 +161,9 @@ def select_by_matching(
             frame = frames[i]
         except InputError as error:
             trouble = trouble or str(error)
+            continue
+        seen[i].double = repeated(frame.image)
+        if seen[i].double:
             continue
         described, kept = descriptor(frame), matcher.keep(frame)
         seen[i].features = matcher.count(kept)
@@ -213,6 +220,8 @@ def _verdict(seen: _Seen, blurred: bool, views_in: Counter[int], good: set[int])
     )
     if found.kept:
         return found
+    if seen.double:
+        return replace(found, reason=DOUBLE)
     if seen.node is None:
         return replace(found, reason=UNREADABLE)
     if blurred:
