@@ -137,6 +137,8 @@ def fit(
     echo(
         f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
     )
+    for doubt in data.doubts:
+        echo(f"warning: {doubt}")
     options = _with_callbacks(trainer_options, output, echo, data, settings)
     trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the command line's parser checked them against Trainer
     if resume:
@@ -182,6 +184,8 @@ def fit(
             "resumed": resumed is not None,
             "units": {"rmse_mm": "mm", "medae_mm": "mm", "distance": "up to scale"},
             "errors": errors,
+            "warnings": data.doubts,
+            "colour": {path: colours.record() for path, colours in data.colours.items()},
         }
         write_run_json(output, "train", {"argv": arguments or []}, started, record)
     return errors
