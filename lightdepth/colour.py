@@ -26,16 +26,18 @@ _REST = 0.75  # quantile of the redness that the rest of a clip has: up to so ma
 _RED_JUMP, _BLUE_JUMP = 0.25, 0.45  # of log R/G and log B/G between neighbours
 _GAIN_JUMP, _CLIPPED_JUMP = 0.6, 0.3  # of the log of brightness; the lower one where the brighter frame is mostly white
 _MOSTLY = 0.5
+_SEEN_JUMP, _ALL = 0.1, 0.75  # a bright picture goes white all over: of its brightness little more can be seen
 _STEADY = 0.5  # spread of the log ratios, over their median, up to which one factor explains them
 _SHARE, _LEAST = 0.05, 2  # of the frames or neighbours, from which it is said
 
 
 @dataclass(frozen=True, eq=False)
 class Glance:
-    """One frame as a small picture: log of the codes (h, w, 3), the cells (h, w) inside the mask that are neither black
-    nor white, and the share of those inside that are white."""
+    """One frame as a small picture: log of the codes (h, w, 3), the cells (h, w) inside the mask that are not black, of
+    these the ones that are not white either, and the share of white ones."""
 
     log: np.ndarray
+    lit: np.ndarray
     usable: np.ndarray
     white: float
 
@@ -49,7 +51,8 @@ class Glance:
         inside = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
         top = small.max(-1)
         white = float((top >= WHITE)[inside].mean()) if inside.any() else 0.0
-        return cls(np.log(np.maximum(small, 0.02)), inside & (top > BLACK) & (top < WHITE), white)
+        lit = inside & (top > BLACK)
+        return cls(np.log(np.maximum(small, 0.02)), lit, lit & (top < WHITE), white)
 
     @property
     def colour(self) -> tuple[float, float]:
@@ -70,26 +73,39 @@ class Step:
     blue: float
     white: float
     """share of the brighter of both that is white"""
+    whitened: float = 0.0
+    """by how much the share of white changed"""
 
     @classmethod
     def between(cls, before: Glance, after: Glance) -> Step | None:
         """None where too little can be seen in both."""
         if before.usable.shape != after.usable.shape:
             return None
-        both = before.usable & after.usable
+        both, white = before.usable & after.usable, max(before.white, after.white)
         if int(both.sum()) < _CELLS:
-            return None
+            return cls._into_white(before, after)
         a, b = before.log[both], after.log[both]
         change = b - a
         steps = b.max(1) - a.max(1), change[:, 0] - change[:, 1], change[:, 2] - change[:, 1]
         brightness, red, blue = map(_one_factor, steps)
-        return cls(brightness, red, blue, max(before.white, after.white))
+        return cls(brightness, red, blue, white, abs(after.white - before.white))
+
+    @classmethod
+    def _into_white(cls, before: Glance, after: Glance) -> Step | None:
+        """Where one of both is white nearly all over: brightness changed by at least as much as is seen."""
+        darker, brighter, sign = (before, after, 1) if before.white < after.white else (after, before, -1)
+        both = darker.usable & brighter.lit
+        if brighter.white <= _MOSTLY or int(both.sum()) < _CELLS:
+            return None
+        least = np.median(brighter.log[both].max(1) - darker.log[both].max(1))
+        return cls(sign * float(least), 0.0, 0.0, brighter.white, brighter.white - darker.white)
 
     @property
     def gain_jumps(self) -> bool:
         """Whether brightness changed by more than the models survive: out of what they know, or into white."""
         size = abs(self.brightness)
-        return size >= _GAIN_JUMP or (size >= _CLIPPED_JUMP and self.white > _MOSTLY)
+        clipped = (size >= _CLIPPED_JUMP and self.white > _MOSTLY) or (size >= _SEEN_JUMP and self.whitened >= _ALL)
+        return size >= _GAIN_JUMP or clipped
 
     @property
     def balance_jumps(self) -> bool:
