@@ -6,7 +6,7 @@ under narrow-band light it is not, and the brightest channel then carries the wa
 compared cell by cell: where the medians of the log ratios are far off and their spread is small, the picture stayed and
 the camera changed.
 
-The limits stand where harm begins, measured on synthetic colons (README: Light that is not white).
+The limits stand where harm begins, measured on synthetic colons (docs/colour.md).
 """
 
 from __future__ import annotations

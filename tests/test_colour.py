@@ -139,9 +139,13 @@ def test_honest_clips_are_not_accused():
         lambda linear, i: linear * np.float32([1, 0.4, 0.4]),  # red all along
     ],
 )
-def test_what_does_no_harm_is_not_accused(change, tmp_path):
-    run = predicted(changed(clip(43), change), tmp_path)
-    assert run["colour"]["doubts"] == [] and run["warnings"] == []
+def test_what_does_no_harm_is_not_accused(change):
+    assert not colours(changed(clip(43), change)).doubts
+
+
+def test_predict_says_nothing_of_an_honest_clip(tmp_path):
+    run = predicted(clip(54), tmp_path)
+    assert run["colour"]["doubts"] == [] and run["warnings"] == [] and run["colour"]["frames"] == 18
 
 
 def test_what_cannot_be_seen_has_no_colour():

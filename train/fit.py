@@ -137,8 +137,8 @@ def fit(
     echo(
         f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
     )
-    for doubt in data.doubts:
-        echo(f"warning: {doubt}")
+    for sentence in data.doubts:
+        echo(f"warning: {sentence}")
     options = _with_callbacks(trainer_options, output, echo, data, settings)
     trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the command line's parser checked them against Trainer
     if resume:
