@@ -11,7 +11,7 @@ from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
 from densify.joining import MergeConfig, Merged, joined_name, merge
 from densify.judging.doubts import DoubtsCalibrated, calibrated_together
-from densify.judging.verdict import Colour, Verdict, proposal, worst
+from densify.judging.verdict import Verdict, doubted, proposal, worst
 from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify
 from densify.predictions import SeenKeyframe
@@ -63,10 +63,7 @@ class Densified:
     def verdict(self) -> Verdict | None:
         """On all of them: the worst; None where nothing was judged."""
         found = worst([r.judgement.verdict for r in self.results if r.judgement is not None])
-        if found is None or not self.doubts:
-            return found
-        colour: Colour = "red" if found.colour == "red" else "amber"
-        return Verdict(colour, "; ".join([*self.doubts, found.sentence]))
+        return None if found is None else doubted(found, self.doubts)
 
     @cached_property
     def uncertainty(self) -> DoubtsCalibrated | None:

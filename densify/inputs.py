@@ -10,6 +10,7 @@ from densify.config import MethodConfig
 from densify.placing import Placing
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets.coloured import colours_of
 from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
@@ -113,6 +114,20 @@ def repaired(run: Run, sparse_map: SparseMap, frames: FrameSequence, config: Sfm
         told.append(repair)
     run.record["repair"] = plain(told)
     return replace(sparse_map, submaps=tuple(submaps))
+
+
+def doubts_of_inputs(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> tuple[str, ...]:
+    """Sentences on map and frames with which no verdict is green: frames that may not be the map's, and light that was
+    not white and steady, which is looked at here, said and recorded."""
+    row_of = {number: row for row, number in enumerate(frames.numbers)}
+    keyframes = [row_of[k.number] for s in sparse_map.submaps for k in s.keyframes if k.number in row_of]
+    colours = colours_of(frames, keyframes)
+    for doubt in colours.doubts:
+        run.warn(doubt)
+    run.record["colour"] = colours.record()
+    pairing = run.record.get("pairing") or {}
+    doubtful = pairing.get("judgement") in ("doubtful", "wrong")
+    return (*([pairing["sentence"]] if doubtful else []), *colours.doubts)
 
 
 @dataclass(frozen=True)

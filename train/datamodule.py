@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import cast
 
 import lightning.pytorch as pl
+import numpy as np
 import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
+from lightdepth.colour import Colours
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
+from lightdepth.datasets.coloured import LOOKED_AT, colours_of
 from lightdepth.datasets.splits import check_apart, folders, read_split
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, flipped, to_batch
@@ -28,6 +31,7 @@ from train.order import Halves, Shuffled
 
 _NO_TUBE = TubeData()
 _WHITE = LossConfig().white
+_LOOKED_AT = 256  # frames whose colours are looked at, of all sequences together
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,7 @@ class FrameDataModule(pl.LightningDataModule):
         self.config, self.tube, self.split = config, config.tube, config.split
         self.sequences, self.val_sequences = config.sequences or [], config.val_sequences or []
         self.size, self.batch_size = (int(config.size[0]), int(config.size[1])), config.batch_size
+        self.colours: dict[str, Colours] = {}
         check_apart(self.sequences, self.val_sequences)
         self._train: ConcatDataset[FrameBatch] | None = None
         self._val: ConcatDataset[FrameBatch] | None = None
@@ -179,12 +184,20 @@ class FrameDataModule(pl.LightningDataModule):
                 "data", "nothing to validate on", "give --data.val-sequences FOLDER, or --data.tube.val-scenes N"
             )
         self._train, self._val = ConcatDataset(train), ConcatDataset(val)
+        most = int(np.clip(_LOOKED_AT // max(1, len(opened)), 4, LOOKED_AT))
+        for (path, frames), listed in zip(opened, rows, strict=True):
+            self.colours[path] = colours_of(frames, listed, most)
+
+    @property
+    def doubts(self) -> list[str]:
+        """Sentences on training sequences that are not what the light's decline can teach from."""
+        return [f"{path}: {doubt}" for path, colours in self.colours.items() for doubt in colours.doubts]
 
     def share(self, other: FrameDataModule) -> bool:
         """Takes the frames of `other`, which is set up, if they are what `setup` would read and render."""
         if self._origin() != other._origin():
             return False
-        self._train, self._val = other._train, other._val
+        self._train, self._val, self.colours = other._train, other._val, other.colours
         return True
 
     def _origin(self) -> tuple[object, ...]:

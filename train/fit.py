@@ -141,6 +141,8 @@ def fit(
     echo(
         f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
     )
+    for sentence in data.doubts:
+        echo(f"warning: {sentence}")
     options = _with_callbacks(trainer_options, output, echo, data, settings)
     with _refusals_named(MisconfigurationException, ValueError, TypeError):
         trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the parser checked them against Trainer
@@ -188,6 +190,8 @@ def fit(
             "resumed": resumed is not None,
             "units": {"rmse_mm": "mm", "medae_mm": "mm", "distance": "up to scale"},
             "errors": errors,
+            "warnings": data.doubts,
+            "colour": {path: colours.record() for path, colours in data.colours.items()},
         }
         write_run_json(output, "train", {"argv": arguments or []}, started, record)
     return errors

@@ -7,7 +7,7 @@ from typing import Literal
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
-from densify.inputs import MapSource, check_unit, fitted_light, map_and_frames
+from densify.inputs import MapSource, check_unit, doubts_of_inputs, fitted_light, map_and_frames
 from densify.joining import MergeConfig
 from densify.page import densify_page, joined_section
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -70,11 +70,10 @@ def densify(
     with run_folder(output, "densify", arguments, overwrite) as run:
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
         run.hash_inputs(**source.files, map=mapped.map)
+        doubts = doubts_of_inputs(run, sparse_map, frames)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         work = Densified.make(frames, sparse_map, model, config, merging if merge else None)
-        pairing = run.record.get("pairing") or {}
-        if pairing.get("judgement") in ("doubtful", "wrong"):
-            work.doubts = (pairing["sentence"],)
+        work.doubts = doubts
         work.write(run, formats, mm_per_unit)
         proposals = {} if mapped.map is None or mapped.repair_map else work.proposals()
         for map_id, proposal in proposals.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from densify.config import LiveConfig
-from densify.inputs import MapSource, check_unit, fitted_light, map_and_frames
+from densify.inputs import MapSource, check_unit, doubts_of_inputs, fitted_light, map_and_frames
 from densify.live.play import play
 from densify.live.record import PlayedRun
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -68,8 +68,9 @@ def live(
     with run_folder(output, "live", arguments, overwrite) as run:
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
         run.hash_inputs(**source.files, map=mapped.map)
+        doubts = doubts_of_inputs(run, sparse_map, frames)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
-        result = PlayedRun(run, config.coverage, mm_per_unit, config.judge.on)
+        result = PlayedRun(run, config.coverage, mm_per_unit, config.judge.on, doubts)
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:
             played = play(frames, sparse_map, model, config, result.add, rate, lambda _: bar.advance())
         result.finish(played, model.name, rate, budget_ms)

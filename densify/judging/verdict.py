@@ -126,6 +126,14 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict | None:
     return max(verdicts, key=lambda v: order.index(v.colour), default=None)
 
 
+def doubted(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
+    """The verdict with sentences on what the surface was made of, with any of which it is not green."""
+    if not doubts:
+        return verdict
+    colour: Colour = "red" if verdict.colour == "red" else "amber"
+    return Verdict(colour, "; ".join([*doubts, verdict.sentence]))
+
+
 def _verdict(j: Judgement) -> Verdict:
     spoke = j.surface.points if j.surface is not None else 0
     number = j.number

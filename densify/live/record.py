@@ -9,7 +9,7 @@ from densify.coverage import Coverage, CoverageConfig
 from densify.coverage import coverage as coverage_of
 from densify.dense_map import DenseMap
 from densify.judging.ahead import Ahead
-from densify.judging.verdict import worst
+from densify.judging.verdict import doubted, worst
 from densify.live.page import live_page
 from densify.live.play import Played, time_spent, timings_picture, write_timings
 from lightdepth.errors import InputError
@@ -46,10 +46,18 @@ class _MapRecord:
 
 class PlayedRun:
     """The run folder of a played sequence; `mm_per_unit` where lengths are to be written in mm, `judged` where there is
-    a verdict."""
+    a verdict, which begins with the sentences `doubts` on what was played."""
 
-    def __init__(self, run: Run, coverage: CoverageConfig, mm_per_unit: float | None, judged: bool = True) -> None:
+    def __init__(
+        self,
+        run: Run,
+        coverage: CoverageConfig,
+        mm_per_unit: float | None,
+        judged: bool = True,
+        doubts: tuple[str, ...] = (),
+    ) -> None:
         self._run, self._coverage, self._mm_per_unit, self._judged = run, coverage, mm_per_unit, judged
+        self._doubts = doubts
         self._records: list[_MapRecord] = []
 
     def add(self, dense: DenseMap) -> None:
@@ -84,6 +92,7 @@ class PlayedRun:
         judged = {record.map: record.judged(played) for record in self._records if self._judged}
         verdict = worst([found.verdict for found in judged.values()])
         if verdict is not None:
+            verdict = doubted(verdict, self._doubts)
             run.log(f"verdict: {verdict}")
         maps = [
             {**record.record(), "verdict": found and plain(found.verdict), "ahead": found and found.record()}

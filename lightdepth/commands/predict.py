@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.colour import ColourMeter
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
@@ -59,14 +60,16 @@ def predict(
         run.hash_inputs(data=source.data)
         if previews:
             (run.folder / "previews").mkdir()
-        nothing = 0
+        nothing, meter = 0, ColourMeter()
         with Progress("Predicting", len(frames)) as bar:
             for i in range(len(frames)):
                 try:
                     frame = frames[i]
                 except InputError as error:
                     run.fail(frames.names[i], str(error))
+                    meter.apart()
                     continue
+                meter.add(frame.image, frame.valid)
                 prediction = model(frame)
                 nothing += not prediction.valid.any()
                 if factor is not None and prediction.uncertainty is not None:
@@ -81,5 +84,9 @@ def predict(
             raise InputError(source.data, "no frame could be read", f"the first: {run.record['failures'][0]['reason']}")
         if nothing:
             run.warn(f"{nothing} of {len(frames)} frames have no valid pixel: they are black, or masked")
+        colours = meter.result()
+        for doubt in colours.doubts:
+            run.warn(doubt)
+        run.record["colour"] = colours.record()
         run.record["checkpoint"] = model.name
         run.record["uncertainty_factor"] = factor

@@ -94,6 +94,9 @@ def adapt(
         target = read_target(run, source, map, fit_light, config, start, sfm, pairing)
         size = config.size or working_size(target.frames[0].camera, start.rows)
         data = frame_data(run, target, more, config, size, start)
+        for doubt in data.doubts:
+            run.warn(doubt)
+        run.record["colour"] = {path: colours.record() for path, colours in data.colours.items()}
         loss = target_loss(start.card, target.light.reflectance > 0, config.replay > 0)
         wall = None
         if target.sparse_map is not None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, field, fields
@@ -17,6 +18,7 @@ import numpy as np
 
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
+from lightdepth.datasets.coloured import colours_of
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.errors import InputError
 from lightdepth.files.writing import Content, write_together
@@ -101,6 +103,9 @@ def select(
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=config.bit_depth)
     sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, reading)
     frames = frames.without_truth()
+    doubts = colours_of(frames).doubts
+    for doubt in doubts:
+        warnings.warn(f"{data}: {doubt}", stacklevel=2)
     settings: dict[str, object]
     if sparse_map is not None and map is not None:
         verdicts, how = _by_map(frames, sparse_map, map, config.map_rules)
@@ -126,7 +131,7 @@ def select(
     listed = [f"# {' '.join(line.split())}" for line in header] + [f"{folder}{v.name}" for v in verdicts if v.kept]
 
     picture = None if no_frames else _sheet(frames, verdicts)
-    page = _page(data, summary, how, settings, verdicts, picture)
+    page = _page(data, summary, how, settings, verdicts, picture, doubts)
     writers: dict[Path, Content] = {
         paths["table"]: _table(verdicts),
         paths["page"]: page.write,
@@ -199,9 +204,12 @@ def _page(
     settings: dict[str, object],
     verdicts: Sequence[FrameVerdict],
     picture: bytes | None,
+    doubts: Sequence[str],
 ) -> Report:
     page = Report("Frames worth training on")
     page.text(f"{data}, {how}: {summary}.")
+    for doubt in doubts:
+        page.text(f"Warning: {doubt}.")
     counts = Counter("kept" if v.kept else v.reason for v in verdicts)
     page.table(["", "frames", "share"], [[what, n, n / len(verdicts)] for what, n in counts.most_common()])
     if any(v.reason == "blur" for v in verdicts):
