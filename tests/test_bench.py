@@ -12,12 +12,13 @@ from raising import refused
 
 from densify.bench import verdict
 from densify.bench.record import COLUMNS, read_bench
-from densify.bench.scenes import SUITE_VERSION, Scene, scenes
+from densify.bench.scenes import SUITE_VERSION, Scene, render, render_moving, scenes
 from densify.bench.verdict import bootstrapped_mean, compare
 from densify.bench.work import BenchConfig
 from densify.commands import bench as command
 from densify.commands.bench import bench
 from lightdepth.tube import ShapeConfig, TubeConfig
+from lightdepth.tube.breathing import BreathingConfig
 
 TINY = Scene("tiny", 0, 40, 5, travel_mm=8.0)
 FIGURES = {"rms_mm": 3.0, "median_mm": 1.5, "depth_abs_rel": 0.08, "scale_error": 0.02}
@@ -67,6 +68,18 @@ def test_a_run_has_every_row_for_every_share_with_units_and_versions(made):
         assert 0 < rows["decline, one scale"]["rms_mm"] < 20
     table = (made / "bench.md").read_text()
     assert "30% wrong points." in table and all(title in table for title in COLUMNS.values()) and "tiny (311)" in table
+
+
+def test_a_wall_that_moves_is_seen_from_the_same_places_and_judged_as_it_is_at_rest(monkeypatch):
+    monkeypatch.setattr(Scene, "colon", TubeConfig(ShapeConfig(length=90.0, step=1.2)))
+    still = render(replace(TINY, frames=201), (64, 52))
+    moving = render_moving(still, BreathingConfig(0.1, period=3.0))
+    assert moving.truth is still.truth and moving.breathing is not None
+    for one, other in zip(still.frames, moving.frames, strict=True):
+        np.testing.assert_array_equal(one.true_world_from_cam, other.true_world_from_cam)
+        assert one.time == other.time
+    share = [f.true_distance.mean() / g.true_distance.mean() for f, g in zip(moving.frames, still.frames, strict=True)]
+    assert share == pytest.approx([1.0, 1.1, 1.0, 0.9, 1.0], abs=0.03)  # one whole breath of 4 s
 
 
 def test_a_run_compared_with_itself_is_within_noise(made, capsys, tmp_path):

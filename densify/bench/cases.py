@@ -49,7 +49,7 @@ CASES: dict[Case, Erring] = {
     "wide side": Erring(MapErrors(side_share=0.45, side_factor=1.3)),
     "drift": Erring(MapErrors(drift=1.3)),
     "fold": Erring(MapErrors(fold_share=0.2)),
-    "loop": Erring(MapErrors(loop_share=0.8, loop_shift=0.5)),
+    "loop": Erring(MapErrors(loop_share=0.5, loop_shift=0.5)),
     "poses": Erring(MapErrors(pose_drift=0.1, pose_drift_deg=5.0)),
     "breath 2": Erring(breathing=BreathingConfig(0.02)),
     "breath 5": Erring(breathing=BreathingConfig(0.05)),

@@ -71,7 +71,7 @@ def run(
             plain TSDF), or both. Options of agreement, bending, contradiction and rectify count for full alone.
         cases: Errors that map points share, each tried with one scale a keyframe and in full, by the last of
             --checkpoints: clean (none), side (30 % of the points, on one side, 15 % too far), wide side (45 %, 30 %),
-            drift (of scale, 30 %), fold (20 % one fold too far), loop (closed where there is none), poses (a bent
+            drift (of scale, 30 %), fold (20 % one fold too far), loop (half closed where there is none), poses (a bent
             path), breath 2, 5 and 10 (the wall breathes by as many %), waves (peristalsis of 10 %). Left out, clean,
             wide side and drift (small), or all (full). More cases take longer.
         image_size: Width and height of the keyframes, pixels; left out, 160 by 128 (small) or 320 by 256 (full). A
