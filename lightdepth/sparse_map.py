@@ -57,6 +57,24 @@ class Keyframe(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class PointColors(Brief):
+    """Colours (n, 3) of points by id (n,), encoded RGB in [0, 1], as the images showed them that a map was made of."""
+
+    ids: np.ndarray
+    values: np.ndarray
+
+    @cached_property
+    def _by_id(self) -> np.ndarray:
+        return np.argsort(self.ids, kind="stable")
+
+    def of(self, ids: np.ndarray) -> np.ndarray:
+        """(n, 3); NaN where a point has none."""
+        rows = self._by_id[np.searchsorted(self.ids, ids, sorter=self._by_id).clip(max=len(self.ids) - 1)]
+        result: np.ndarray = np.where((self.ids[rows] == ids)[:, None], self.values[rows], np.nan)
+        return result
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Submap(Brief):
     """Points (n, 3) by id, and the keyframes that share their frame of reference and scale."""
 
@@ -73,6 +91,8 @@ class Submap(Brief):
     """Numbers of the frames whose place the map's SLAM knew, keyframes or not; None where nothing tells."""
     guessed_clock: bool = False
     """True when keyframes are counted from a clock's first stamp, which was taken for the first frame."""
+    colors: PointColors | None = None
+    """Colours of points, by id; None where the map has none."""
 
     def __post_init__(self) -> None:
         if not len(self.points):

@@ -12,12 +12,13 @@ from raising import refused
 
 from densify.bench import verdict
 from densify.bench.record import COLUMNS, read_bench
-from densify.bench.scenes import SUITE_VERSION, Scene, scenes
+from densify.bench.scenes import SUITE_VERSION, Scene, render, render_moving, scenes
 from densify.bench.verdict import bootstrapped_mean, compare
 from densify.bench.work import BenchConfig
 from densify.commands import bench as command
 from densify.commands.bench import bench
 from lightdepth.tube import ShapeConfig, TubeConfig
+from lightdepth.tube.breathing import BreathingConfig
 
 TINY = Scene("tiny", 0, 40, 5, travel_mm=8.0)
 FIGURES = {"rms_mm": 3.0, "median_mm": 1.5, "depth_abs_rel": 0.08, "scale_error": 0.02}
@@ -40,7 +41,7 @@ def made(tmp_path_factory) -> Path:
             "--wrong-shares",
             "[0.0, 0.3]",
             "--cases",
-            "[side]",
+            "[loop, breath 5]",
         ]
         assert bench(["-o", str(folder), *arguments, "--first-seed", "311"]) == 0
     return folder
@@ -51,28 +52,42 @@ def test_a_run_has_every_row_for_every_share_with_units_and_versions(made):
     assert found["kind"] == "bench" and found["suite_version"] == SUITE_VERSION and found["versions"]["numpy"]
     assert "mm" in found["unit"] and "Sim(3)" in found["alignment"] and found["config"]["first_seed"] == 311
     places = [(c["scene"], c["seed"], c["wrong_share"]) for c in found["cells"]]
-    assert places == [("tiny", 311, 0.0), ("tiny", 311, 0.3), ("tiny", 311, 0.03)]
+    assert places == [("tiny", 311, 0.0), ("tiny", 311, 0.3), *2 * [("tiny", 311, 0.03)]]
     for cell in found["cells"][:2]:
         assert list(cell["rows"]) == ["sparse map", "sparse inliers", "decline, paper", "decline, full"]
         assert cell["frames"] == 40 and cell["trajectory"]["keyframes"] == 5 and cell["trajectory"]["rms_ate_mm"] < 0.2
         dense = cell["rows"]["decline, full"]
         assert 0 < dense["median_mm"] <= dense["rms_mm"] < 10 and dense["keyframes_aligned"] == 5
         assert 0 <= dense["scale_error"] < 0.3 and 0 < dense["depth_abs_rel"] < 0.3
-    clean, dirty, erring = (c["rows"] for c in found["cells"])
+    clean, dirty, *erring = (c["rows"] for c in found["cells"])
     assert dirty["sparse map"]["rms_mm"] > 10 * clean["sparse map"]["rms_mm"]
     assert dirty["sparse inliers"]["rms_mm"] < 0.2 * dirty["sparse map"]["rms_mm"]
-    assert found["cells"][2]["case"] == "side" and list(erring) == ["sparse map", "decline, one scale", "decline, full"]
-    assert 0 < erring["decline, one scale"]["rms_mm"] < 20
+    assert [c["case"] for c in found["cells"][2:]] == ["loop", "breath 5"]
+    for rows in erring:
+        assert list(rows) == ["sparse map", "decline, one scale", "decline, full"]
+        assert 0 < rows["decline, one scale"]["rms_mm"] < 20
     table = (made / "bench.md").read_text()
     assert "30% wrong points." in table and all(title in table for title in COLUMNS.values()) and "tiny (311)" in table
+
+
+def test_a_wall_that_moves_is_seen_from_the_same_places_and_judged_as_it_is_at_rest(monkeypatch):
+    monkeypatch.setattr(Scene, "colon", TubeConfig(ShapeConfig(length=90.0, step=1.2)))
+    still = render(replace(TINY, frames=201), (64, 52))
+    moving = render_moving(still, BreathingConfig(0.1, period=3.0))
+    assert moving.truth is still.truth and moving.breathing is not None
+    for one, other in zip(still.frames, moving.frames, strict=True):
+        np.testing.assert_array_equal(one.true_world_from_cam, other.true_world_from_cam)
+        assert one.time == other.time
+    share = [f.true_distance.mean() / g.true_distance.mean() for f, g in zip(moving.frames, still.frames, strict=True)]
+    assert share == pytest.approx([1.0, 1.1, 1.0, 0.9, 1.0], abs=0.03)  # one whole breath of 4 s
 
 
 def test_a_run_compared_with_itself_is_within_noise(made, capsys, tmp_path):
     assert bench(["compare", str(made), str(made / "bench.json"), "-o", str(tmp_path / "c.json")]) == 0
     assert "B is within noise." in capsys.readouterr().out
     found = json.loads((tmp_path / "c.json").read_text())
-    assert found["verdict"] == "within noise" and found["paired"] and len(found["judged"]) == 20
-    assert {j["row"] for j in found["judged"]} >= {"decline, full", "decline, full (side)", "decline, one scale (side)"}
+    assert found["verdict"] == "within noise" and found["paired"] and len(found["judged"]) == 30
+    assert {j["row"] for j in found["judged"]} >= {"decline, full", "decline, full (loop)", "decline, one scale (loop)"}
     for j in found["judged"]:
         none = 1 if j["change_is"] == "ratio" else 0
         assert j["change"] == none and j["low"] < none < j["high"]

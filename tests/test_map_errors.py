@@ -9,10 +9,18 @@ import pytest
 from colons import EXACT, colon, slam
 from raising import refused
 
-from lightdepth.sparse_map import SparseMap, Submap, typical_distance
-from lightdepth.tube.map_errors import MapErrors, pose_drift, scale_drift, side_moved, with_errors, wrong_fold
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap, typical_distance
+from lightdepth.tube.map_errors import (
+    MapErrors,
+    pose_drift,
+    scale_drift,
+    side_moved,
+    with_errors,
+    wrong_fold,
+    wrong_loop,
+)
 
-ALL = MapErrors(drift=1.3, side_share=0.3, fold_share=0.1, pose_drift=0.1, pose_drift_deg=3.0)
+ALL = MapErrors(drift=1.3, side_share=0.3, fold_share=0.1, loop_share=0.4, pose_drift=0.1, pose_drift_deg=3.0)
 
 
 @cache
@@ -105,6 +113,37 @@ def test_a_patch_of_wall_is_shifted_ahead_to_the_next_fold():
     assert spread[0] < 0.75 * spread[1]
 
 
+def test_a_wrong_loop_puts_one_place_nearer_another_and_bends_what_lies_between():
+    before = short_tracks()
+    after = wrong_loop(before, 4 / 9, 0.5, 0.6)  # of 10 keyframes: from the fourth to the eighth
+    old, new = (np.stack([k.center for k in s.keyframes]) for s in (before, after))
+    np.testing.assert_allclose(new[:4], old[:4], atol=1e-9)
+    np.testing.assert_allclose(new[7], (old[3] + old[7]) / 2, atol=1e-9)
+    steps = [np.linalg.norm(np.diff(centers, axis=0), axis=1) for centers in (new, old)]
+    assert steps[0] / steps[1] == pytest.approx([1] * 3 + [0.5] * 4 + [1] * 2, abs=0.03)
+    first, last = (seen_by(before, keyframes) for keyframes in (before.keyframes[:4], before.keyframes[7:]))
+    shift = after.points - before.points
+    assert (shift[first & ~seen_by(before, before.keyframes[4:])] == 0).all()
+    own = last & ~seen_by(before, before.keyframes[:7])
+    there = [s.keyframes[-1].in_camera(s.points[own]) for s in (before, after)]
+    assert np.median(np.abs(there[1] - there[0])) < 1e-9  # what is seen after the loop alone is carried rigidly
+
+
+def seen_by(submap: Submap, keyframes: tuple[Keyframe, ...]) -> np.ndarray:
+    return np.isin(submap.point_ids, np.concatenate([k.point_ids for k in keyframes]))
+
+
+def test_a_loop_closed_onto_one_place_looks_from_there_as_it_did_from_the_other():
+    first, *_, last = wrong_loop(exact(), 1.0, 1.0, 0.0).keyframes
+    np.testing.assert_allclose(last.cam_from_map, first.cam_from_map, atol=1e-9)
+
+
+def test_points_of_both_places_of_a_wrong_loop_are_fused_where_they_meet():
+    after = wrong_loop(short_tracks(), 4 / 9, 0.5, 0.6)
+    twice = len(after.points) - len(np.unique(after.points, axis=0))
+    assert len(np.unique(short_tracks().points, axis=0)) == len(after.points) and 10 < twice < 0.2 * len(after.points)
+
+
 def test_poses_drift_as_far_as_asked_and_the_points_stay():
     after = pose_drift(exact(), 0.2, 5.0, False, rng())
     pairs = list(zip(exact().keyframes, after.keyframes, strict=True))
@@ -174,6 +213,9 @@ def test_a_map_of_one_keyframe_can_err():
         {"pose_drift": float("nan")},
         {"pose_drift_deg": -1.0},
         {"fold_shift": float("inf")},
+        {"loop_share": 2.0},
+        {"loop_shift": -0.5},
+        {"loop_at": 1.5},
     ],
 )
 def test_sizes_that_mean_nothing_are_refused(changes):

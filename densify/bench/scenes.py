@@ -15,7 +15,8 @@ import numpy as np
 from densify.evaluation.truth import Truth, read_truth
 from lightdepth.datasets import FrameSequence
 from lightdepth.sparse_map import SparseMap
-from lightdepth.tube import ShapeConfig, Tube, TubeConfig, lens, realistic, render_sequence
+from lightdepth.tube import ShapeConfig, Tube, TubeConfig, TubeSequence, lens, realistic, render_sequence
+from lightdepth.tube.breathing import Breathing, BreathingConfig
 from lightdepth.tube.map_errors import MapErrors, with_errors
 from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
 from lightdepth.tube.variant import VariantTube
@@ -57,6 +58,7 @@ _POINTS = 2000
 """Of the sparse map of a short sequence, as in the paper's table 2."""
 _TRACKED = 500
 """Points that a keyframe of a SLAM like a real one observes at most."""
+_FPS = 50
 _WIDE, _STRONG, _WEAK = (0.0, 1.0), (0.5, 0.7), (0.0, 0.2)
 _SHORT = (  # frames and keyframes are t2a's to s3a's of the paper
     Scene("short1", 0, 194, 16, travel_mm=20, reflectance=_WEAK),
@@ -80,16 +82,18 @@ def scenes(size: Size, first_seed: int = 400) -> list[Scene]:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """A scene's keyframes with truth, and the wall that they see."""
+    """A scene's keyframes with truth, the wall that they see (the one at rest, where it moves), and how it moves."""
 
     scene: Scene
     frames: FrameSequence
     truth: Truth
+    breathing: Breathing | None = None
 
     def tracked(self, wrong_share: float, errors: MapErrors) -> SparseMap:
         """What a SLAM like a real one makes of it, with errors that come together."""
         config = SlamConfig("tracked", 1, self.scene.maps, points_per_keyframe=_TRACKED, spurious=wrong_share)
-        return with_errors(simulate_slam(list(self.frames), config, self.scene.seed).map, errors, self.scene.seed)
+        found = simulate_slam(list(self.frames), config, self.scene.seed, self.breathing)
+        return with_errors(found.map, errors, self.scene.seed)
 
     def slam(self, wrong_share: float) -> SimulatedSlam:
         """The SLAM's export with a share of wrong points."""
@@ -100,15 +104,43 @@ class Rendered:
 
 def render(scene: Scene, image_size: tuple[int, int]) -> Rendered:
     """The keyframes of a scene at (width, height), numbered as among all of its frames; a screening is a withdrawal."""
-    kind = VariantTube if scene.wall == "other" else Tube
-    camera = lens(scene.lens, *image_size)
-    made = render_sequence(scene.seed, scene.keyframes, camera, scene.travel_mm, scene.colon, kind=kind).frames
-    if scene.maps > 1:
-        made = made[::-1]
-    numbers = np.linspace(0, scene.frames - 1, scene.keyframes).round().astype(int)
-    named = [replace(f, name=f"{n:06d}", time=n / 50) for f, n in zip(made, numbers.tolist(), strict=True)]
-    sequence = FrameSequence([f.name for f in named], named.__getitem__, f"{scene.name} (seed {scene.seed})")
+    sequence = _sequence(scene, _made(scene, image_size, BreathingConfig()))
     truth = read_truth(sequence)
     assert truth.surface is not None
     # The paper's accuracy is to the true cloud. Far points take minutes to find the closest triangle.
     return Rendered(scene, sequence, replace(truth, surface=replace(truth.surface, mesh=None, mesh_source="")))
+
+
+def render_moving(still: Rendered, config: BreathingConfig) -> Rendered:
+    """The same keyframes of the same colon while its wall moves. Poses and the wall that surfaces are judged by stay;
+    the frames' truth is their own. The period is the nearest of which the scene has a whole number, so that the mean of
+    the wall over the scene is the wall at rest."""
+    scene, camera = still.scene, still.frames[0].camera
+    assert scene.maps == 1, scene.name
+    seconds = (scene.frames - 1) / _FPS
+    period = seconds / max(1, round(seconds / config.period))
+    made = _made(scene, (camera.width, camera.height), replace(config, period=period))
+    return replace(still, frames=_sequence(scene, made), breathing=made.breathing)
+
+
+def _made(scene: Scene, image_size: tuple[int, int], breathing: BreathingConfig) -> TubeSequence:
+    kind = VariantTube if scene.wall == "other" else Tube
+    camera, times = lens(scene.lens, *image_size), [n / _FPS for n in _numbers(scene)]
+    return render_sequence(
+        *(scene.seed, scene.keyframes, camera, scene.travel_mm, scene.colon),
+        kind=kind,
+        breathing=breathing,
+        times=times,
+    )
+
+
+def _sequence(scene: Scene, made: TubeSequence) -> FrameSequence:
+    frames = made.frames[::-1] if scene.maps > 1 else made.frames
+    named = [replace(f, name=f"{n:06d}", time=n / _FPS) for f, n in zip(frames, _numbers(scene), strict=True)]
+    return FrameSequence([f.name for f in named], named.__getitem__, f"{scene.name} (seed {scene.seed})")
+
+
+def _numbers(scene: Scene) -> list[int]:
+    """Of the keyframes among all frames."""
+    numbers: list[int] = np.linspace(0, scene.frames - 1, scene.keyframes).round().astype(int).tolist()
+    return numbers

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from densify.bench.cases import CASES, WRONG_SHARE, Case
-from densify.bench.scenes import Rendered, Scene, Size, render
+from densify.bench.scenes import Rendered, Scene, Size, render, render_moving
 from densify.config import DensifyConfig, Recipe
 from densify.dense_map import DenseMap
 from densify.evaluation.errors import compare_depth, rms
@@ -89,15 +89,26 @@ class BenchConfig:
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """A rendered scene with what each model says of its keyframes, by model and frame."""
+    """A rendered scene with what each model says of its keyframes, by model and frame; and the same, said by the last
+    model alone, of the cases in which its wall moves."""
 
     rendered: Rendered
     predictions: Mapping[str, Mapping[str, DepthPrediction]]
+    moving: Mapping[Case, Predicted] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, rendered: Rendered, models: Sequence[DepthModel]) -> Predicted:
+        return cls(rendered, {m.name: {f.name: m(f) for f in rendered.frames} for m in models})
 
 
-def predicted(scene: Scene, image_size: tuple[int, int], models: Sequence[DepthModel]) -> Predicted:
-    rendered = render(scene, image_size)
-    return Predicted(rendered, {m.name: {f.name: m(f) for f in rendered.frames} for m in models})
+def predicted(
+    scene: Scene, image_size: tuple[int, int], models: Sequence[DepthModel], cases: Sequence[Case] = ()
+) -> Predicted:
+    """A scene, and those of `cases` that need images of their own."""
+    still = Predicted.of(render(scene, image_size), models)
+    moves = {case: CASES[case].breathing for case in cases if CASES[case].breathing.amplitude > 0}
+    moving = {case: Predicted.of(render_moving(still.rendered, how), models[-1:]) for case, how in moves.items()}
+    return replace(still, moving=moving)
 
 
 def load_models(checkpoints: Sequence[str]) -> list[DepthModel]:
@@ -211,8 +222,9 @@ def run_scene(scene: Predicted, config: BenchConfig, on_row: Callable[[], None] 
 
 
 def _case_cell(scene: Predicted, case: Case, config: BenchConfig, on_row: Callable[[], None]) -> CellFigures:
+    scene = scene.moving.get(case, scene)
     rendered = scene.rendered
-    sparse_map = rendered.tracked(WRONG_SHARE, CASES[case])
+    sparse_map = rendered.tracked(WRONG_SHARE, CASES[case].errors)
     sparse = [_model(s, sparse=s.points) for s in sparse_map.submaps]
     model, known = list(scene.predictions.items())[-1]
     rows = {SPARSE: _judged(sparse, rendered, "sparse")}

@@ -71,8 +71,9 @@ def run(
             plain TSDF), or both. Options of agreement, bending, contradiction and rectify count for full alone.
         cases: Errors that map points share, each tried with one scale a keyframe and in full, by the last of
             --checkpoints: clean (none), side (30 % of the points, on one side, 15 % too far), wide side (45 %, 30 %),
-            drift (of scale, 30 %), fold (20 % one fold too far), poses (a bent path). Left out, clean, wide side and
-            drift (small), or all (full). More cases take longer.
+            drift (of scale, 30 %), fold (20 % one fold too far), loop (half closed where there is none), poses (a bent
+            path), breath 2, 5 and 10 (the wall breathes by as many %), waves (peristalsis of 10 %). Left out, clean,
+            wide side and drift (small), or all (full). More cases take longer.
         image_size: Width and height of the keyframes, pixels; left out, 160 by 128 (small) or 320 by 256 (full). A
             larger one shows finer detail and takes longer.
         overwrite: Replace a run made before.
@@ -116,7 +117,7 @@ def _cells(config: BenchConfig, models: Sequence[DepthModel]) -> tuple[list[Cell
     with Progress("Benchmark", sum(config.rows_of(s) * s.keyframes for s in chosen)) as bar:
         for scene in chosen:
             start = time.perf_counter()
-            seen = predicted(scene, config.image_size, models)
+            seen = predicted(scene, config.image_size, models, config.cases_of(scene))
             cells += run_scene(seen, config, partial(bar.advance, scene.keyframes))
             seconds[scene.name] = round(time.perf_counter() - start, 3)
     return cells, seconds

@@ -6,10 +6,9 @@ Points of one keyframe err together, so keyframes are what is counted; the point
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
-
-from lightdepth.detective.witnesses import Witnesses
 
 LEAST_POINTS = 30
 """Sightings from which a reading can be judged."""
@@ -21,6 +20,13 @@ by any other, and those with keypoints 2 px off gain .01 at most."""
 _SHARPER = 0.05  # gain of the corners' logarithm; right readings lose by any other, but .02 by half a pixel
 _FITS = 0.5  # NCC, below which a reading is not right, however much better it is
 _MOST_KEYFRAMES = 0.75  # of the keyframes, that have to agree
+
+
+class Seen(Protocol):
+    """Sightings: rows (n, k) of the k keyframes that have a say in each."""
+
+    @property
+    def rows(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -45,16 +51,16 @@ class Fit:
     def wins(self) -> bool:
         """Whether it fits clearly better than the reading at hand, or as well and keypoints are clearly more of
         corners by it; not where they are clearly less."""
-        by_corners = self.corners is not None and self.corners.gain >= _SHARPER and self.corners._agreed
-        alike = self.gain >= CLEAR and self._agreed and not (self.corners is not None and self.corners.loses)
+        by_corners = self.corners is not None and self.corners.gain >= _SHARPER and self.corners.agreed
+        alike = self.gain >= CLEAR and self.agreed and not (self.corners is not None and self.corners.loses)
         return (alike or (by_corners and not self.loses)) and self.keyframes >= 3 and self.likeness >= _FITS
 
     @property
     def rivals(self) -> bool:
         """Whether it fits better, but too little or in too few keyframes to say that it is right."""
         corners = self.corners
-        alike = self.gain >= CLEAR / 2 and self._agreed and not (corners is not None and corners.loses)
-        by_corners = corners is not None and corners.gain >= _SHARPER / 2 and corners._agreed and not self.loses
+        alike = self.gain >= CLEAR / 2 and self.agreed and not (corners is not None and corners.loses)
+        by_corners = corners is not None and corners.gain >= _SHARPER / 2 and corners.agreed and not self.loses
         return (alike or by_corners) and not self.wins
 
     @property
@@ -65,7 +71,8 @@ class Fit:
         return self.gain < 0 and self.better <= 1 - _MOST_KEYFRAMES and self.sure <= -_SIGMAS
 
     @property
-    def _agreed(self) -> bool:
+    def agreed(self) -> bool:
+        """Whether enough of keyframes and points say so."""
         return self.better >= _MOST_KEYFRAMES and self.sure >= _SIGMAS
 
     def record(self) -> dict[str, object]:
@@ -81,7 +88,7 @@ class Fit:
         }
 
 
-def by_keyframe(witnesses: Witnesses, values: np.ndarray) -> dict[int, float]:
+def by_keyframe(witnesses: Seen, values: np.ndarray) -> dict[int, float]:
     """Median of values (n,) of the sightings of each keyframe that has enough; NaN is left out."""
     found = {}
     for row in np.unique(witnesses.rows).tolist():
@@ -91,7 +98,7 @@ def by_keyframe(witnesses: Witnesses, values: np.ndarray) -> dict[int, float]:
     return found
 
 
-def compared(name: str, witnesses: Witnesses, votes: np.ndarray, at_hand: np.ndarray) -> Fit | None:
+def compared(name: str, witnesses: Seen, votes: np.ndarray, at_hand: np.ndarray) -> Fit | None:
     """Another reading's votes (n,) against those at hand, sighting by sighting; None where too few can be compared.
     Sightings that are the same by both have nothing to say, unless nearly all are."""
     difference = votes - at_hand
@@ -112,9 +119,7 @@ def compared(name: str, witnesses: Witnesses, votes: np.ndarray, at_hand: np.nda
     )
 
 
-def compared_apart(
-    name: str, one: tuple[Witnesses, np.ndarray], at_hand: tuple[Witnesses, np.ndarray] | None
-) -> Fit | None:
+def compared_apart(name: str, one: tuple[Seen, np.ndarray], at_hand: tuple[Seen, np.ndarray] | None) -> Fit | None:
     """The same for readings whose sightings are not the same: keyframes of one against all of the other, where it has
     any."""
     others = np.array(list(by_keyframe(*one).values()))

@@ -3,7 +3,8 @@
 Keyframes and frames meet by number alone. Where they meet rightly, the patches around a map point look alike in any two
 keyframes that saw it; the reading at hand is held against others that occur in practice (frames counted otherwise,
 images mirrored or undistorted, poses the other way round), on the same points. A reading is wrong where another
-fits clearly better, or where the patches are no more alike than those around different points. Nothing is compared with
+fits clearly better, or where the patches are no more alike than those around different points. Where points have
+colours, these vote besides (lightdepth.detective.colours). Nothing is compared with
 an absolute bar that a dim or noisy film would miss.
 """
 
@@ -17,7 +18,8 @@ import numpy as np
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.counting import BY_NUMBER, Counting
 from lightdepth.datasets.sequence import FrameSequence
-from lightdepth.detective.evidence import Fit, by_keyframe, compared, compared_apart, told_from_chance
+from lightdepth.detective.colours import Colours, colour_sightings
+from lightdepth.detective.evidence import LEAST_POINTS, Fit, by_keyframe, compared, compared_apart, told_from_chance
 from lightdepth.detective.geometry import geometry_of
 from lightdepth.detective.judging import Findings, judged
 from lightdepth.detective.patches import Pictures
@@ -47,7 +49,7 @@ _WITHOUT = 0.1  # of the keyframes, without a frame, from which they are looked 
 def investigate(sparse_map: SparseMap, frames: FrameSequence, given: CameraModel | None = None) -> Verdict:
     """The verdict on a map and its frames: of several submaps, the worst. `given` is the camera that the user gave in
     place of the map's. Reads some 50 frames of each submap."""
-    pictures = Pictures(frames)
+    pictures = Pictures(frames, any(s.colors is not None for s in sparse_map.submaps))
     chosen = sorted(sparse_map.submaps, key=lambda s: -len(s.keyframes))[:_SUBMAPS]
     places = _PLACES if len(chosen) == 1 else _PLACES - 1
     verdicts = [judged(_findings(submap, pictures, given, places)) for submap in chosen]
@@ -58,9 +60,10 @@ def _findings(submap: Submap, pictures: Pictures, given: CameraModel | None, pla
     geometry = geometry_of(submap, given)
     seen = _with_sightings(submap)
     witnesses = None if seen is None else _witnesses(seen, pictures, BY_NUMBER, places)
+    colours = None if seen is None else _colours(seen, pictures, witnesses)
     if seen is None or witnesses is None:
         unseen = tuple(_other_maps(submap, pictures, places, None)) if submap.weak_visibility else ()
-        return Findings(submap.id, geometry, tried=unseen)
+        return Findings(submap.id, geometry, tried=unseen, colours=colours)
     at_hand = witnesses.votes(pictures, BY_NUMBER)
     # A map without keypoints has its points where its poses put them, not on corners.
     corners = None if submap.weak_visibility else witnesses.corners(pictures, BY_NUMBER)
@@ -107,7 +110,38 @@ def _findings(submap: Submap, pictures: Pictures, given: CameraModel | None, pla
         strange,
         tuple(tried),
         tuple(controls),
+        colours,
     )
+
+
+def _colours(submap: Submap, pictures: Pictures, witnesses: Witnesses | None) -> Colours | None:
+    """What the points' colours say, in the keyframes that patches are compared in, or else in some; None where they
+    have none, or the frames do not show enough of them."""
+    there = set(pictures.frames.numbers)
+    usable = np.array([k.number in there for k in submap.keyframes])
+    sightings = colour_sightings(submap, usable, [] if witnesses is None else np.unique(witnesses.rows).tolist())
+    votes = np.zeros(0) if sightings is None else sightings.votes(pictures, BY_NUMBER)
+    if sightings is None or np.isfinite(votes).sum() < LEAST_POINTS:
+        return None
+    tried: list[tuple[Reading, Fit]] = []
+
+    def hold_against(reading: Reading) -> Fit | None:
+        other = sightings.votes(pictures, reading.counting, reading.moved)
+        fit = compared(reading.name, sightings, other, votes)
+        if fit is not None:
+            tried.append((reading, fit))
+        return fit
+
+    keyframes = by_keyframe(sightings, votes)
+    found = Colours(Fit(AS_GIVEN.name, float(np.nanmedian(votes)), len(keyframes)))
+    for step in (-1, 1):
+        _follow(step, hold_against(shifted(step)), hold_against)
+    for reading in other_images(submap.keyframes[0].camera, _camera_of(pictures)):
+        hold_against(reading)
+    if not found.alike and not any(found.clear(fit) for _, fit in tried):
+        for reading in other_rates(max(k.number for k in submap.keyframes)):
+            hold_against(reading)
+    return replace(found, tried=tuple(tried))
 
 
 def _follow(step: int, fit: Fit | None, hold_against: Callable[[Reading], Fit | None]) -> None:

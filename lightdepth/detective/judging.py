@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lightdepth.detective.colours import Colours
 from lightdepth.detective.evidence import CLEAR, LEAST_POINTS, Fit
 from lightdepth.detective.geometry import Geometry
 from lightdepth.detective.readings import Reading
@@ -36,11 +37,12 @@ class Findings:
     tried: tuple[tuple[Reading, Fit], ...] = ()
     elsewhere: tuple[Fit, ...] = ()
     """frames far away, which the map cannot be of"""
+    colours: Colours | None = None
 
 
 def judged(found: Findings) -> Verdict:
     """The verdict; images first, as they know most."""
-    judgement, sentence, cure = _said(found)
+    judgement, sentence, cure = _with_colours(found, *_said(found))
     fits = (*(fit for _, fit in found.tried), *found.elsewhere)
     untold = _untold(found)
     if judgement == "agrees" and untold:
@@ -55,7 +57,39 @@ def judged(found: Findings) -> Verdict:
         found.geometry,
         untold,
         found.submap,
+        found.colours,
     )
+
+
+def _with_colours(found: Findings, judgement: Judgement, sentence: str, cure: str) -> tuple[Judgement, str, str]:
+    """What the points' colours add to what else was said. A reading that they name is refused, but for patches that
+    deny it; other colours alone are a doubt, and none where patches agree: they need not be those of images."""
+    colours = found.colours
+    if colours is None or judgement == "wrong":
+        return judgement, sentence, cure
+    best, own = colours.best, colours.at_hand
+    if best is not None:
+        reading, fit = best
+        said = (
+            f"points and images agree by {own.likeness:.2f} in the order of their colours, but by {fit.likeness:.2f} "
+        )
+        said += f"(better in {fit.better:.0%} of {fit.keyframes} keyframes) if {reading.name}"
+        by_patches = next((other for tried, other in found.tried if tried.name == reading.name), None)
+        if by_patches is not None and by_patches.loses:
+            return "doubtful", f"{sentence}; but {said}", cure or reading.cure
+        return "wrong", said, f"{reading.cure}, {_TRUST}"
+    surely = found.at_hand is not None and found.points >= LEAST_POINTS and found.at_hand.likeness >= _SURELY
+    if judgement == "doubtful":
+        return judgement, sentence, cure
+    if colours.unlike and not surely:
+        said = f"points and images agree by {own.likeness:.2f} in the order of their colours, where 0 is chance"
+        return "doubtful", f"{sentence}; {said}", "are these the frames that the map and its colours were made of?"
+    if judgement == "cannot tell" and colours.alike:
+        said = (
+            f"points and images agree by {own.likeness:.2f} in the order of their colours ({own.keyframes} keyframes)"
+        )
+        return "agrees", f"frames and map agree: {said}, and no other reading fits better (patches cannot tell)", ""
+    return judgement, sentence, cure
 
 
 def _said(found: Findings) -> tuple[Judgement, str, str]:
@@ -149,7 +183,9 @@ def _geometry(found: Geometry) -> tuple[Judgement, str, str] | None:
 def _untold(found: Findings) -> tuple[str, ...]:
     """Readings that fit about as well as the one at hand."""
     tried = [(reading, fit) for reading, fit in found.tried if reading.counting.rate == 1]
+    denied = set() if found.colours is None else found.colours.denied()
     alike = [reading.name for reading, fit in tried if not (fit.loses or fit.wins or fit.rivals)]
+    alike = [name for name in alike if name not in denied]
     if found.geometry is None or not found.geometry.tells_half_a_pixel:
         alike.append("keypoints are half a pixel off")
     return tuple(alike)

@@ -26,10 +26,21 @@ _CONTRAST = 2.0  # a patch counts where it varies by so many times what noise do
 
 @dataclass(frozen=True)
 class Picture:
-    """A grey image (H, W) float32, NaN where no tissue shows, and the deviation of its noise."""
+    """A grey image (H, W) float32, NaN where no tissue shows, the deviation of its noise, and its colours (H, W, 3)
+    uint8; None where they were not asked for."""
 
     grey: np.ndarray
     noise: float
+    colors: np.ndarray | None = None
+
+    def color_at(self, pixels: np.ndarray) -> np.ndarray:
+        """Colours (n, 3) in [0, 1] at pixels (n, 2); NaN outside, and where no tissue shows."""
+        assert self.colors is not None
+        places = pixels[:, None] - 0.5
+        u, v = np.where(np.isfinite(places), places, -1e4).clip(-1e4, 1e5).astype(np.float32).transpose(2, 0, 1)
+        seen = cv2.remap(self.colors, np.ascontiguousarray(u), np.ascontiguousarray(v), cv2.INTER_LINEAR)
+        result: np.ndarray = np.where(np.isfinite(_at(self.grey, places)), seen[:, 0] / 255, np.nan)
+        return result
 
     @cached_property
     def corners(self) -> np.ndarray:
@@ -43,9 +54,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Frames by number as small grey images, each read once."""
+    """Frames by number as small grey images, each read once; with their colours, where these are `colored`."""
 
     frames: FrameSequence
+    colored: bool = False
     _kept: dict[int, Picture | None] = field(default_factory=dict)
 
     def of(self, number: int) -> Picture | None:
@@ -62,13 +74,16 @@ class Pictures:
         if frame is None:
             return None
         grey = cv2.cvtColor(np.ascontiguousarray(frame.image, np.float32), cv2.COLOR_RGB2GRAY)
+        image = frame.image
         mask = np.ones_like(grey) if frame.mask is None else frame.mask.astype(np.float32)
         smaller = LONGER_SIDE / max(grey.shape)
         if smaller < 1:
             size = round(smaller * grey.shape[1]), round(smaller * grey.shape[0])
             grey, mask = (cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in (grey, mask))
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if self.colored else image
         shown = (mask > 0.999) & np.isfinite(grey)
-        return Picture(np.where(shown, grey, np.nan).astype(np.float32), _noise(grey, shown))
+        colors = np.rint(255 * np.nan_to_num(image)).clip(0, 255).astype(np.uint8) if self.colored else None
+        return Picture(np.where(shown, grey, np.nan).astype(np.float32), _noise(grey, shown), colors)
 
 
 def _noise(grey: np.ndarray, shown: np.ndarray) -> float:

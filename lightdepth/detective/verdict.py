@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from lightdepth.detective.colours import Colours
 from lightdepth.detective.evidence import Fit
 from lightdepth.detective.geometry import Geometry
 
@@ -34,6 +35,8 @@ class Verdict:
     """readings that fit about as well, so that the images cannot tell"""
     submap: int | None = None
     """which submap it is about"""
+    colours: Colours | None = None
+    """what the points' colours say; None where they have none"""
 
     def record(self) -> dict[str, object]:
         """As run.json holds it."""
@@ -44,5 +47,6 @@ class Verdict:
             "told_from_chance": self.from_chance,
             "geometry": None if self.geometry is None else self.geometry.record(),
             "could_not_tell": list(self.untold),
+            "colours": None if self.colours is None else self.colours.record(),
         }
         return {"judgement": self.judgement, "sentence": self.sentence, "figures": figures}

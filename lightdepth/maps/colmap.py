@@ -11,7 +11,7 @@ Formats: COLMAP documentation, "Output format".
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from lightdepth.files.text import is_comment, numbered_lines, parse_integer, par
 from lightdepth.maps.checks import checked
 from lightdepth.maps.convention import COLMAP, MapConvention
 from lightdepth.maps.sensors import of_one_sensor
-from lightdepth.sparse_map import Keyframe, Submap, at_its_place, near_origin
+from lightdepth.sparse_map import Keyframe, PointColors, Submap, at_its_place, near_origin
 
 PARTS = ("cameras", "images", "points3D")
 
@@ -55,10 +55,11 @@ def read_submap(folder: Path, map_id: int, convention: MapConvention = COLMAP) -
     paths = {part: folder / f"{part}{suffix}" for part in PARTS}
     if suffix == ".bin":
         cameras, images = read_cameras_binary(paths["cameras"]), _read_images_binary(paths["images"])
-        ids, points = _read_points_binary(paths["points3D"])
+        ids, points, colors = _read_points_binary(paths["points3D"])
     else:
         cameras, images = read_cameras_text(paths["cameras"]), _read_images_text(paths["images"])
         ids, points = read_points_text(paths["points3D"])
+        colors = read_colors_text(paths["points3D"])
     if not images:
         raise InputError(f"{paths['images']}", "no images in it", "an empty map cannot be densified, leave it out")
     keyframes = []
@@ -72,7 +73,7 @@ def read_submap(folder: Path, map_id: int, convention: MapConvention = COLMAP) -
         keyframes.append(
             convention.keyframe(image.name, cameras[image.camera_id], image.pose, image.pixels, image.point_ids)
         )
-    return assembled(folder, map_id, keyframes, ids, points)
+    return replace(assembled(folder, map_id, keyframes, ids, points), colors=colors)
 
 
 def assembled(
@@ -143,7 +144,7 @@ def _read_images_text(path: Path) -> list[ModelImage]:
 
 
 def read_points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Point ids (n,) and points (n, 3). Colour, error and track may be missing, and are not used."""
+    """Point ids (n,) and points (n, 3). Colour, error and track may be missing; error and track are not used."""
     expected = "POINT3D_ID X Y Z [R G B ERROR TRACK...]"
     entries = [(number, line.split(None, 4)[:4]) for number, line in numbered_lines(path)]
     try:
@@ -167,6 +168,23 @@ def read_points_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return ids, points
 
 
+def read_colors_text(path: Path) -> PointColors | None:
+    """Colours of the points, for a file that `read_points_text` has read; None where not every point has one."""
+    entries = [line.split(None, 7)[:7] for _, line in numbered_lines(path)]
+    try:
+        ids = np.array([tokens[0] for tokens in entries], dtype=np.int64)
+        values = np.array([tokens[4:7] for tokens in entries], dtype=np.float64)
+    except ValueError:  # a point without a colour, or with something else in its place
+        return None
+    return _colors(ids, values)
+
+
+def _colors(ids: np.ndarray, values: np.ndarray) -> PointColors | None:
+    """None where colours (n, 3), 0 to 255, are none, or all the same, as programs write that know none."""
+    known = values.ndim == 2 and values.size and values.min() >= 0 and values.max() <= 255 and np.ptp(values, 0).any()
+    return PointColors(ids, values / 255) if known else None
+
+
 # ---- binary
 
 
@@ -186,18 +204,20 @@ def _read_images_binary(path: Path) -> list[ModelImage]:
     return images
 
 
-def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    data, ids, points = BinaryFile(path), [], []
+def _read_points_binary(path: Path) -> tuple[np.ndarray, np.ndarray, PointColors | None]:
+    data, ids, points, colors = BinaryFile(path), [], [], []
     for _ in range(data.take("Q")[0]):
         point_id, *xyz = data.take("Q3d")
-        data.take("3Bd")
+        colors.append(data.take("3Bd")[:3])
         data.array(np.dtype("<u4"), 2 * data.take("Q")[0])
         ids.append(point_id)
         points.append(xyz)
     data.end()
     if ids and max(ids) >= _NO_POINT:
         raise InputError(path, f"point id {max(ids)}", "expected ids below 2^63")
-    return np.array(ids, np.int64), np.array(points, np.float64).reshape(-1, 3)
+    known = np.array(ids, np.int64)
+    found = _colors(known, np.array(colors, np.float64).reshape(-1, 3))
+    return known, np.array(points, np.float64).reshape(-1, 3), found
 
 
 # ---- writing

@@ -27,7 +27,7 @@ from lightdepth.files.colmap_cameras import read_cameras_text
 from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
 from lightdepth.files.text import is_comment, parse_numbers, text_lines
 from lightdepth.maps.checks import checked, guessed
-from lightdepth.maps.colmap import assembled, read_points_text, read_submap
+from lightdepth.maps.colmap import assembled, read_colors_text, read_points_text, read_submap
 from lightdepth.maps.convention import CameraMissing, MapConvention
 from lightdepth.sparse_map import SparseMap, Submap, at_its_place
 from lightdepth.which_frame import frame_number
@@ -114,7 +114,8 @@ def read_exported_submap(
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     keyframes = [convention.keyframe(p.name, camera, p.cam_from_map, *none) for p in chosen]
     submap = assembled(folder, map_id, keyframes, ids, points, check=guessed if of_all else checked)
-    return replace(submap, localised=tuple(n + convention.frame_offset for n in numbers))
+    colors = read_colors_text(folder / "points3D.txt")
+    return replace(submap, localised=tuple(n + convention.frame_offset for n in numbers), colors=colors)
 
 
 def _camera(folder: Path, convention: MapConvention, own: CameraModel | None) -> CameraModel:

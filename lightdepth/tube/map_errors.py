@@ -1,13 +1,13 @@
 """Errors of a map that come together: neighbouring points, and whole stretches of the path, are wrong alike.
 
-A SLAM seldom errs point by point. It loses its scale along the way, takes one fold for the next, and puts a whole side
-of the wall too far away. Each function here takes a submap whose truth is known and gives one with such an error of a
-stated size; they compose in any order. `with_errors` applies what a MapErrors names.
+A SLAM seldom errs point by point. It loses its scale along the way, takes one fold for the next, closes a loop that is
+none, and puts a whole side of the wall too far away. Each function here takes a submap whose truth is known and gives
+one with such an error of a stated size; they compose in any order. `with_errors` applies what a MapErrors names.
 
 What stays: the ids, who observed what, and the recorded pixels, which are what the camera saw. What moves: positions in
 the map, of points, keyframes or both. So the ids say which points moved, and by how much. Rotations of keyframes
-change under `pose_drift` alone. Sizes have no unit: a factor, or a share of the submap's typical distance D
-(lightdepth.sparse_map.typical_distance).
+change under `pose_drift` and `wrong_loop` alone. Sizes have no unit: a factor, or a share of the submap's typical
+distance D (lightdepth.sparse_map.typical_distance).
 
 Notation: c_k, R_k a keyframe's centre and map_from_cam rotation, p a point, K(p) the keyframes that observed it (the
 nearest one, where none did), t_k in [0, 1] how far along the path k stands.
@@ -21,6 +21,7 @@ from typing import overload
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from lightdepth.errors import InputError
@@ -46,6 +47,15 @@ class MapErrors:
     fold_shift: float = 0.6
     """How far the patch of fold_share is moved ahead, as a share of the typical distance from a submap's keyframes to
     its points. A larger one moves it farther; below 0 it moves back."""
+    loop_share: float = 0.0
+    """Length, as a share of each submap's path in [0, 1], of a loop that is closed where there is none, between two
+    places along it that are taken for neighbours (see loop_shift); 0 closes none. A larger one makes a longer loop."""
+    loop_shift: float = 0.5
+    """How far the second of the two places of loop_share is moved towards the first, as a share in [0, 1] of the way
+    between them; 1 makes them one. A larger one bends the map more."""
+    loop_at: float | None = None
+    """Where the first of the two places of loop_share is, as a share in [0, 1] of where it can be; left out, it is
+    drawn. A larger one closes the loop later on the path."""
     pose_drift: float = 0.0
     """How far the last keyframe is from its true place, as a share of the path's length; the error grows along the
     path, from 0 at the first. A larger one bends the path more."""
@@ -60,12 +70,14 @@ class MapErrors:
         for name in ("drift", "side_factor"):
             if not 0.1 <= getattr(self, name) <= 10:
                 raise InputError(name, f"{getattr(self, name)}", "expected a factor from 0.1 to 10")
-        for name in ("side_share", "fold_share"):
+        for name in ("side_share", "fold_share", "loop_share", "loop_shift"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(name, f"{getattr(self, name)}", "expected a share from 0 to 1")
         for name in ("pose_drift", "pose_drift_deg"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(name, f"{getattr(self, name)}", "expected 0 or more")
+        if self.loop_at is not None and not 0 <= self.loop_at <= 1:
+            raise InputError("loop_at", f"{self.loop_at}", "expected a share from 0 to 1")
         if not np.isfinite(self.fold_shift):
             raise InputError("fold_shift", f"{self.fold_shift}", "expected a finite number")
 
@@ -77,16 +89,19 @@ def with_errors(map_or_submap: SparseMap, errors: MapErrors, seed: int) -> Spars
 def with_errors(map_or_submap: Submap | SparseMap, errors: MapErrors, seed: int) -> Submap | SparseMap:
     """The submap, or every submap of a map, with the errors; a seed draws each alike whatever the others are.
 
-    The side, then the fold, then the drift of poses, then that of scale: what is local first.
+    The side, then the fold, then the loop, then the drift of poses, then that of scale: what is local first.
     """
     if isinstance(map_or_submap, SparseMap):
         return replace(map_or_submap, submaps=tuple(with_errors(s, errors, seed) for s in map_or_submap.submaps))
     submap = map_or_submap
-    side, fold, poses = np.random.default_rng([seed, submap.id, 2]).spawn(3)
+    side, fold, poses, loop = np.random.default_rng([seed, submap.id, 2]).spawn(4)
     if errors.side_share > 0 and errors.side_factor != 1:
         submap = side_moved(submap, errors.side_share, errors.side_factor, side)
     if errors.fold_share > 0 and errors.fold_shift != 0:
         submap = wrong_fold(submap, errors.fold_share, errors.fold_shift, fold)
+    if errors.loop_share > 0 and errors.loop_shift > 0:
+        at = loop.random() if errors.loop_at is None else errors.loop_at
+        submap = wrong_loop(submap, errors.loop_share, errors.loop_shift, at)
     if errors.pose_drift > 0 or errors.pose_drift_deg > 0:
         submap = pose_drift(submap, errors.pose_drift, errors.pose_drift_deg, errors.points_follow, poses)
     return submap if errors.drift == 1 else scale_drift(submap, errors.drift)
@@ -148,6 +163,58 @@ def wrong_fold(submap: Submap, share: float, shift: float, rng: np.random.Genera
     away = np.linalg.norm(submap.points - middle, axis=1)
     chosen = np.argsort(away, kind="stable")[: round(share * len(away))]
     return _moved(submap, chosen, (submap.points + shift * typical_distance(submap) * ahead)[chosen])
+
+
+def wrong_loop(submap: Submap, share: float, shift: float, at: float) -> Submap:
+    """A loop is closed between keyframes i and j > i, `share` of the path apart: what i saw is taken for what j sees,
+    one fold for the next, so that j is moved by `shift` of its way to i.
+
+    What a pose graph makes of it (Dubbelman and Browning 2015, without scale): the turn is spread along the loop, then
+    the gap that is left; what comes after j follows it rigidly, what comes before i stays. With G = (R_i R_j^T)^shift
+    and u_k from 0 at i to 1 at j, steps turn by G^u, and what j lacks is added in proportion to u. A point goes to the
+    mean of where K(p) carry it. Then points are fused: one that j saw is put onto the nearest that i saw within a tenth
+    of D, each onto another; the rest of that wall is there twice. No bundle adjustment follows.
+    """
+    order, along = _path(submap)
+    last = len(order) - 1
+    if last < 1:
+        return submap
+    start = at * (1 - share)
+    i = min(int(np.abs(along - start).argmin()), last - 1)
+    j = max(int(np.abs(along - start - share).argmin()), i + 1)
+    centers = np.stack([submap.keyframes[k].center for k in order])
+    axes = np.stack([submap.keyframes[k].cam_from_map[:3, :3].T for k in order])  # map_from_cam
+    whole = along[j] - along[i]
+    u = ((along - along[i]) / whole).clip(0, 1) if whole > 0 else np.arange(-i, last + 1 - i).clip(0, j - i) / (j - i)
+    turn = Rotation.from_rotvec(shift * u[:, None] * Rotation.from_matrix(axes[i] @ axes[j].T).as_rotvec()).as_matrix()
+    steps = np.einsum("kij,kj->ki", (turn[1:] + turn[:-1]) / 2, np.diff(centers, axis=0))
+    moved = centers[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, 0)])
+    moved += u[:, None] * (centers[j] + shift * (centers[i] - centers[j]) - moved[j])
+
+    def follow(k: int, points: np.ndarray) -> np.ndarray:
+        result: np.ndarray = moved[k] + (points - centers[k]) @ turn[k].T
+        return result
+
+    keyframes = list(submap.keyframes)
+    for k, place in enumerate(order.tolist()[i + 1 :], i + 1):
+        keyframes[place] = _posed(keyframes[place], (turn[k] @ axes[k]).T, moved[k])
+    seen = _seen(submap)[order]
+    # Where nothing moves, rounding would.
+    points = np.where(seen[i + 1 :].any(0)[:, None], _followed(submap, order, follow), submap.points)
+    points = _fused(points, np.flatnonzero(seen[j] & ~seen[i]), np.flatnonzero(seen[i]), 0.1 * typical_distance(submap))
+    return replace(submap, keyframes=tuple(keyframes), points=points)
+
+
+def _fused(points: np.ndarray, rows: np.ndarray, onto: np.ndarray, reach: float) -> np.ndarray:
+    """Points with those of `rows` put onto the nearest of `onto`, where each is the other's nearest and in reach."""
+    if not len(rows) or not len(onto):
+        return points
+    away, nearest = cKDTree(points[onto]).query(points[rows])
+    back = cKDTree(points[rows]).query(points[onto])[1]
+    fused = (away <= reach) & (back[nearest] == np.arange(len(rows)))
+    points = points.copy()
+    points[rows[fused]] = points[onto[nearest[fused]]]
+    return points
 
 
 def pose_drift(submap: Submap, share: float, degrees: float, points_follow: bool, rng: np.random.Generator) -> Submap:

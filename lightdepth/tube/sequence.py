@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,12 +39,14 @@ def render_sequence(
     mask: np.ndarray | None = None,
     device: str = "auto",
     breathing: BreathingConfig | None = None,
+    times: Sequence[float] | None = None,
 ) -> TubeSequence:
     """A colon drawn from `seed`, seen in `count` frames along `travel` mm. Frames carry the light's true calibration
     with gain 1 (exposure is automatic, so the true gain differs per frame), distance and pose in mm. `mask` (H, W) is
     the field of view, an octagon if left out. Rendered on `device` (auto: the GPU where there is one) in batches: a
     seed gives the same frames everywhere, up to rounding. A wall that is `breathing` is another one in
-    each frame, which takes longer. Raises InputError for a device that is not there."""
+    each frame, which takes longer. `times` (count,) are the frames' own, s; left out, there are 30 a second. Raises
+    InputError for a device that is not there."""
     rng = np.random.default_rng(seed)
     config = config or TubeConfig()
     tube = kind(config, rng, light, rendering_device(device))
@@ -54,10 +56,12 @@ def render_sequence(
     moving = None
     if breathing is not None and breathing.amplitude > 0:
         moving, at_once = Breathing(tube.shape, breathing), 1
+    when = [n / 30.0 for n in range(count)] if times is None else list(times)
+    assert len(when) == count, (len(when), count)
     frames: list[Frame] = []
     for first in range(0, count, at_once):
         batch = poses[first : first + at_once]
-        seen = tube if moving is None else tube.reshaped(moving.shape_at(first / 30.0))
+        seen = tube if moving is None else tube.reshaped(moving.shape_at(when[first]))
         for pose, view in zip(batch, seen.views(batch, camera, mask, rng), strict=True):
             frames.append(
                 Frame(
@@ -66,7 +70,7 @@ def render_sequence(
                     camera,
                     replace(tube.light, gain=1.0),
                     mask,
-                    time=len(frames) / 30.0,
+                    time=when[len(frames)],
                     true_distance=view.distance,
                     true_world_from_cam=pose,
                 )
