@@ -66,7 +66,7 @@ class Densified:
         if found is None or not self.doubts:
             return found
         colour: Colour = "red" if found.colour == "red" else "amber"
-        return Verdict(colour, "; ".join([*self.doubts, found.sentence]))
+        return replace(found, colour=colour, sentence="; ".join([*self.doubts, found.sentence]))
 
     @cached_property
     def uncertainty(self) -> DoubtsCalibrated | None:

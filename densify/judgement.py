@@ -32,14 +32,15 @@ from lightdepth.triangulation import PointNoise
 
 
 class Judge:
-    """The judge of one submap; switched off, it keeps and undoes nothing. Raises InputError where no keyframe observes
-    a point."""
+    """The judge of one submap; switched off, it hides, keeps and undoes nothing. Raises InputError where it is switched
+    on and no keyframe observes a point."""
 
     def __init__(self, submap: Submap, config: DensifyConfig) -> None:
         self._submap, self._config = submap, config
         self._method = Method(config.alignment, config.agreement, config.bending)
         self._images = Images(config.judge.parallax)
-        self._fold = submap_folds(submap, config.judge.folds, config.judge.seed)
+        on, none = config.judge.on, np.zeros(0, int)
+        self._fold = submap_folds(submap, config.judge.folds, config.judge.seed) if on else none
         self._ratios: dict[str, np.ndarray] = {}
         self._sigma: dict[str, np.ndarray] = {}
         self._told: dict[str, Seen] = {}

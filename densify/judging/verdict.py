@@ -13,6 +13,8 @@ from densify.judging.doubts import Doubts
 from densify.judging.withheld import Withheld
 
 Colour = Literal["green", "amber", "red"]
+Asked = Literal["", "images", "map"]
+"""Who a verdict's number is from: the images' parallax, or the map's own points where the images are silent."""
 
 GREEN, RED = 0.065, 0.125
 """Disagreement, as a share of the distance, up to which a surface is green and from which it is red."""
@@ -54,10 +56,15 @@ class Judgement:
     def number(self) -> float:
         """The program's own estimate of the surface's error, as a share of the distance: what the images say, or the
         map where they are silent. Not an error: that takes truth."""
-        if self.surface is not None and self.surface.points >= _LEAST:
+        if self.judge == "images" and self.surface is not None:
             met = self.surface.median_met
             return float("inf") if met is None else met
         return self.hidden.median if self.hidden is not None else float("inf")
+
+    @property
+    def judge(self) -> Asked:
+        """Whose word the number is."""
+        return "images" if self.surface is not None and self.surface.points >= _LEAST else "map"
 
     @property
     def verdict(self) -> Verdict:
@@ -99,6 +106,11 @@ class Verdict:
 
     colour: Colour
     sentence: str
+    number: float = float("inf")
+    """share of the distance by which the judge puts the wall from the surface, in the median; infinite where none can
+    say"""
+    judge: Asked = ""
+    """whose word the number is; empty where nobody could be asked"""
 
     def __str__(self) -> str:
         return f"{self.colour}: {self.sentence}"
@@ -121,9 +133,9 @@ def proposal(j: Judgement) -> str:
 
 
 def worst(verdicts: Sequence[Verdict]) -> Verdict | None:
-    """The verdict on a run: the worst of its submaps'."""
+    """The verdict on a run: the worst of its submaps', of equal colours the one with the larger number."""
     order = ("green", "amber", "red")
-    return max(verdicts, key=lambda v: order.index(v.colour), default=None)
+    return max(verdicts, key=lambda v: (order.index(v.colour), v.number), default=None)
 
 
 def _verdict(j: Judgement) -> Verdict:
@@ -156,11 +168,11 @@ def _verdict(j: Judgement) -> Verdict:
         )
     remarks += _no_merit(light)
     if red:
-        return Verdict("red", "; ".join(red + amber + remarks))
+        return Verdict("red", "; ".join(red + amber + remarks), number, j.judge)
     if amber:
-        return Verdict("amber", "; ".join(amber + remarks))
+        return Verdict("amber", "; ".join(amber + remarks), number, j.judge)
     remarks.append(f"{j.aligned} of {j.keyframes} keyframes aligned")
-    return Verdict("green", "; ".join([said, *remarks]))
+    return Verdict("green", "; ".join([said, *remarks]), number, j.judge)
 
 
 def ahead_verdict(columns: Columns, number: float, keyframes: int, aligned: int) -> Verdict:
