@@ -7,7 +7,7 @@ that are made for the judge alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -53,6 +53,11 @@ class Judge:
             sigma = None if k.observed is None else sigma_at(seen.prediction, k.observed.pixels)
             if sigma is not None:
                 self._sigma[k.keyframe.name] = sigma
+
+    @property
+    def told(self) -> Mapping[str, Seen]:
+        """What the images tell of each keyframe's distances, by name; nothing before `braked`."""
+        return self._told
 
     def braked(self, keyframes: Sequence[AlignedKeyframe]) -> list[AlignedKeyframe]:
         """The same keyframes, each with as much of its bend as makes things better, and the reason for less."""
