@@ -64,7 +64,7 @@ class Judgement:
     @property
     def judge(self) -> Asked:
         """Whose word the number is."""
-        return "images" if self.surface is not None and self.surface.points >= _LEAST else "map"
+        return "images" if spoke(self.surface) else "map"
 
     @property
     def verdict(self) -> Verdict:
@@ -121,7 +121,7 @@ def proposal(j: Judgement) -> str:
 
     That the map's error and not the light's is what they see, they cannot tell: it may help, and is soon tried.
     """
-    if j.surface is None or j.surface.points < _LEAST:
+    if not spoke(j.surface):
         return ""
     if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
         seen = "its points bend the depth against the images"
@@ -138,27 +138,34 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict | None:
     return max(verdicts, key=lambda v: (order.index(v.colour), v.number), default=None)
 
 
+def spoke(surface: Withheld | None) -> bool:
+    """Whether the images say enough of a surface to judge it by."""
+    return surface is not None and surface.points >= _LEAST
+
+
+def _by_images(surface: Withheld) -> tuple[str, list[str], list[str]]:
+    """What the images say of a surface, and which of it makes it red, and amber."""
+    number = float("inf") if surface.median_met is None else surface.median_met
+    said = f"the images' parallax puts the wall {_share(number)} from the surface in the median"
+    said += f" ({surface.points} pixels)"
+    red, amber = ([said], []) if number > RED else ([], [said] if number > GREEN else [])
+    if surface.miss > _MISSES:
+        amber.append(f"{surface.miss:.0%} of what they see is not on the surface")
+    return said, red, amber
+
+
 def _verdict(j: Judgement) -> Verdict:
-    spoke = j.surface.points if j.surface is not None else 0
     number = j.number
     if not j.aligned:
         return Verdict("red", "no keyframe could be aligned")
-    red, amber = [], []
-    if spoke >= _LEAST and j.surface is not None:
-        said = f"the images' parallax puts the wall {_share(number)} from the surface in the median ({spoke} pixels)"
-        if number > RED:
-            red.append(said)
-        elif number > GREEN:
-            amber.append(said)
-        if j.surface.miss > _MISSES:
-            amber.append(f"{j.surface.miss:.0%} of what they see is not on the surface")
+    if j.surface is not None and spoke(j.surface):
+        said, red, amber = _by_images(j.surface)
     else:
         said = "the images have too little texture or parallax to judge by"
-        amber.append(f"{said}; hidden blocks of the map's wall are {_share(number)} off")
+        red, amber = [], [f"{said}; hidden blocks of the map's wall are {_share(number)} off"]
         if not number <= RED:
             red.append(f"hidden blocks of the map's wall are {_share(number)} off, and the images say nothing")
-    if 2 * j.aligned < j.keyframes:
-        amber.append(f"only {j.aligned} of {j.keyframes} keyframes could be aligned")
+    amber += _few(j.keyframes, j.aligned)
     light = j.images if j.images.count >= _LEAST else j.blocks
     remarks = []
     if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
@@ -175,22 +182,41 @@ def _verdict(j: Judgement) -> Verdict:
     return Verdict("green", "; ".join([said, *remarks]), number, j.judge)
 
 
-def ahead_verdict(columns: Columns, number: float, keyframes: int, aligned: int) -> Verdict:
-    """On a live surface, by points that the map measured after it; `number` is the median share by which they are off.
+def ahead_verdict(
+    columns: Columns, by_points: float, surface: Withheld | None, keyframes: int, aligned: int
+) -> Verdict:
+    """On a live surface: by the images, as on densify's; where they say nothing, by points that the map measured after
+    it, `by_points` being the median share by which they are off.
 
-    The map alone judges, so that nothing is green: points and surface may have drifted together.
+    Where the map alone judges nothing is green: points and surface may have drifted together.
     """
     if not aligned:
         return Verdict("red", "no keyframe could be aligned")
-    few = [f"only {aligned} of {keyframes} keyframes could be aligned"] if 2 * aligned < keyframes else []
+    few = _few(keyframes, aligned)
+    merit = _no_merit(columns) if columns.count >= _LEAST else []
+    if surface is not None and spoke(surface):
+        said, red, amber = _by_images(surface)
+        colour: Colour = "red" if red else "amber" if amber or few else "green"
+        number = float("inf") if surface.median_met is None else surface.median_met
+        told = [*dict.fromkeys([said, *red, *amber]), *few]
+        if columns.count >= _LEAST:
+            told.append(f"new points of the map were {_share(by_points)} from the depth before them")
+        return Verdict(colour, "; ".join([*told, *merit]), number, "images")
     if columns.count < _LEAST:
-        return Verdict("amber", "; ".join([f"{columns.count} new points are too few to judge by", *few]))
+        told = [f"{columns.count} new points are too few to judge by, and the images say nothing", *few]
+        return Verdict("amber", "; ".join(told))
     said = (
-        f"new points of the map are {_share(number)} from the depth that was there before them, in the median "
+        f"new points of the map are {_share(by_points)} from the depth that was there before them, in the median "
         f"({columns.count} points; a constant distance {_share(columns.constant)})"
     )
-    colour: Colour = "red" if number > RED else "amber"
-    return Verdict(colour, "; ".join([said, "the map alone was asked, not the images", *few, *_no_merit(columns)]))
+    alone = "the map alone was asked, not the images"
+    colour = "red" if by_points > RED else "amber"
+    return Verdict(colour, "; ".join([said, alone, *few, *merit]), by_points, "map")
+
+
+def _few(keyframes: int, aligned: int) -> list[str]:
+    """A reason for amber where most keyframes have no part in the surface."""
+    return [f"only {aligned} of {keyframes} keyframes could be aligned"] if 2 * aligned < keyframes else []
 
 
 def _no_merit(columns: Columns) -> list[str]:
