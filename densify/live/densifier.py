@@ -254,7 +254,7 @@ class Densifier:
 
     def seen(self) -> dict[str, Seen]:
         """What the images of the keyframes tell of distances, by keyframe; nothing where the judge is switched off. It
-        takes some 0.1 s a keyframe, so it is for the end. Raises InputError while there is no keyframe."""
+        takes some 0.15 s a keyframe, so it is for the end. Raises InputError while there is no keyframe."""
         views = {name: kept.view for name, kept in self._kept.items()}
         return images_of(views, self._submap(), self._parallax) if self._parallax.on else {}
 
