@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -17,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from densify.dense_map import DOUBTED, Contribution, DenseMap
 from densify.fusion.rectify import FULL, SurfaceView
+from densify.judging.images import Seen
 from densify.trust import coarse_sigma, expected_error, vertex_normals
 from lightdepth.datasets import FrameSequence
 from lightdepth.prediction import DepthPrediction
@@ -159,11 +161,13 @@ class Given:
         return cls(contribution(view, prediction), coarse_sigma(prediction))
 
 
-def with_contributions(dense: DenseMap, given: Mapping[str, Given]) -> DenseMap:
+def with_contributions(
+    dense: DenseMap, given: Mapping[str, Given], seen: Mapping[str, Seen] = MappingProxyType({})
+) -> DenseMap:
     """The dense map with the error that is expected of its vertices, with what each of its aligned keyframes gave, by
-    name, and what it looks at."""
+    name, and what it looks at. `seen` is what the keyframes' images tell of distances, as far as they were asked."""
     sigmas = {name: g.sigma for name, g in given.items() if g.sigma is not None}
-    dense = replace(dense, expected_error=expected_error(dense, sigmas))
+    dense = replace(dense, expected_error=expected_error(dense, sigmas, seen))
     own = [k for k in dense.submap.keyframes if k.name in given]
     return replace(dense, contributions={k.name: looked_at(dense, k, given[k.name].contribution) for k in own})
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Protocol
 
@@ -16,6 +17,7 @@ from densify.dense_map import DenseMap
 from densify.fusion.plain import PlainTsdf, undistorted
 from densify.fusion.rectify import SurfaceView, surface_view
 from densify.fusion.volume import TsdfVolume
+from densify.judging.images import Seen
 from densify.predictions import SeenKeyframe
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Submap
@@ -27,8 +29,8 @@ class Fuser(Protocol):
     def add(self, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
         """Fuses a keyframe whose alignment is ok, but for its contradicted pixels."""
 
-    def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
-        """The surface as it is now."""
+    def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...], seen: Mapping[str, Seen]) -> DenseMap:
+        """The surface as it is now; `seen` is what the keyframes' images tell of distances, by name."""
 
 
 def fuser_for(submap: Submap, config: DensifyConfig) -> Fuser:
@@ -61,8 +63,8 @@ class FullFuser:
         self._volume.integrate(view, aligned.keyframe.cam_from_map)
         self._given[aligned.keyframe.name] = Given.of(view, prediction)
 
-    def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
-        return with_contributions(DenseMap.of(self._volume, submap, alignments), self._given)
+    def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...], seen: Mapping[str, Seen]) -> DenseMap:
+        return with_contributions(DenseMap.of(self._volume, submap, alignments), self._given, seen)
 
 
 class PaperFuser:
@@ -78,5 +80,5 @@ class PaperFuser:
         depth = undistorted(alignment.applied(seen.prediction), seen.frame.image, self._far * alignment.range_90)
         self._volume.integrate(*depth, aligned.keyframe.cam_from_map)
 
-    def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
+    def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...], seen: Mapping[str, Seen]) -> DenseMap:
         return DenseMap(submap, *self._volume.extract_mesh(), alignments, self._voxel)

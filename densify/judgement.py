@@ -7,7 +7,7 @@ that are made for the judge alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,14 +32,15 @@ from lightdepth.triangulation import PointNoise
 
 
 class Judge:
-    """The judge of one submap; switched off, it keeps and undoes nothing. Raises InputError where no keyframe observes
-    a point."""
+    """The judge of one submap; switched off, it hides, keeps and undoes nothing. Raises InputError where it is switched
+    on and no keyframe observes a point."""
 
     def __init__(self, submap: Submap, config: DensifyConfig) -> None:
         self._submap, self._config = submap, config
         self._method = Method(config.alignment, config.agreement, config.bending)
         self._images = Images(config.judge.parallax)
-        self._fold = submap_folds(submap, config.judge.folds, config.judge.seed)
+        on, none = config.judge.on, np.zeros(0, int)
+        self._fold = submap_folds(submap, config.judge.folds, config.judge.seed) if on else none
         self._ratios: dict[str, np.ndarray] = {}
         self._sigma: dict[str, np.ndarray] = {}
         self._told: dict[str, Seen] = {}
@@ -52,6 +53,11 @@ class Judge:
             sigma = None if k.observed is None else sigma_at(seen.prediction, k.observed.pixels)
             if sigma is not None:
                 self._sigma[k.keyframe.name] = sigma
+
+    @property
+    def told(self) -> Mapping[str, Seen]:
+        """What the images tell of each keyframe's distances, by name; nothing before `braked`."""
+        return self._told
 
     def braked(self, keyframes: Sequence[AlignedKeyframe]) -> list[AlignedKeyframe]:
         """The same keyframes, each with as much of its bend as makes things better, and the reason for less."""

@@ -101,7 +101,7 @@ def densify_submap(
         if on_keyframe is not None:
             on_keyframe(submap, each, seen)
     with clock("extract"):
-        dense = fuser.dense_map(submap, tuple(each.alignment for each in keyframes))
+        dense = fuser.dense_map(submap, tuple(each.alignment for each in keyframes), judge.told)
     with clock("cover"):
         covered = None if dense.weights is None else coverage(dense, config.coverage)
     with clock("judge"):

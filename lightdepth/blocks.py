@@ -8,6 +8,8 @@ phylogenetic structure").
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 
 from lightdepth.sparse_map import Submap, typical_distance
@@ -54,4 +56,25 @@ def wall_folds(points: np.ndarray, size: float, folds: int = 5, seed: int = 0) -
 def submap_folds(submap: Submap, folds: int = 5, seed: int = 0) -> np.ndarray:
     """The fold (n,) of each point of a submap, by blocks of half a typical distance. Raises InputError where no
     keyframe observes a point."""
-    return wall_folds(submap.points, BLOCK_SIZE * typical_distance(submap), folds, seed)
+    return wall_folds(submap.points, _side(submap), folds, seed)
+
+
+def submap_blocks(submap: Submap, seed: int = 0) -> np.ndarray:
+    """The block (n,) of each point of a submap, of half a typical distance, which folds may halve. Raises InputError
+    where no keyframe observes a point."""
+    return wall_blocks(submap.points, _side(submap), seed)
+
+
+def hidden_in_turn(folds: np.ndarray, judging: Iterable[int] | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For each fold the points (n,) bool that are hidden, and those that may be used meanwhile.
+
+    Folds are those of the points (n,), but for numbers below 0, which are never hidden; or those in `judging`, also
+    where they have no points.
+    """
+    for fold in np.unique(folds[folds >= 0]).tolist() if judging is None else judging:
+        hidden: np.ndarray = folds == fold
+        yield hidden, ~hidden
+
+
+def _side(submap: Submap) -> float:
+    return BLOCK_SIZE * typical_distance(submap)

@@ -29,6 +29,11 @@ class ObservedDistances(Brief):
     def subset(self, chosen: np.ndarray) -> ObservedDistances:
         return ObservedDistances(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
+    def with_others(self, others: ObservedDistances) -> ObservedDistances:
+        """These, then the others."""
+        names = self.__dataclass_fields__
+        return ObservedDistances(*(np.concatenate([getattr(o, name) for o in (self, others)]) for name in names))
+
 
 def observed_distances(keyframe: Keyframe, submap: Submap, prediction: DepthPrediction) -> ObservedDistances:
     """Pairs of mapped and predicted distance at the projections of the points that the keyframe observed.

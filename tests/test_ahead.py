@@ -7,12 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from colons import EXACT, colon, slam, truth
+from test_judging import side_moved
 from test_live import fed, points_of
 
 from densify.config import LiveConfig
 from densify.judging.ahead import NOTHING, Ahead, AheadConfig, running
 from densify.judging.verdict import ahead_verdict
+from densify.judging.withheld import Withheld
 from densify.live.densifier import Densifier
+from densify.live.play import Finished
+from lightdepth.camera import Pinhole
+from lightdepth.parallax import ParallaxConfig
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +100,30 @@ def test_the_verdict_is_amber_at_best_and_red_where_new_points_are_far_off():
     assert "adds nothing" in of(0.05, 0.05).verdict.sentence
     assert "only 1 of 4" in of(0.01, 0.3, aligned=1).verdict.sentence
     assert of(0.01, 0.3, aligned=0).verdict.colour == "red"
-    assert ahead_verdict(Ahead.of([], 4, 4).columns, np.inf, 4, 4).colour == "amber"
+    assert ahead_verdict(Ahead.of([], 4, 4).columns, np.inf, None, 4, 4).colour == "amber"
+
+
+@pytest.mark.parametrize(("met", "colour"), [(0.02, "green"), (0.08, "amber"), (0.2, "red")])
+def test_where_the_images_speak_the_verdict_is_by_them_as_in_densify(met, colour):
+    """New points lie at the rim, where a surface is off by more: what they say is a remark."""
+    row = np.array([0.2, 0.2, 0.4, 0.4, 0.2])
+    errors, surface = [np.tile(row, (100, 1))], Withheld(500, met, 0.3, 0.0, met)
+    found = Ahead.of(errors, 4, 4, surface)
+    assert (found.verdict.colour, found.number, found.judge) == (colour, met, "images"), found.verdict
+    assert "new points of the map were 20.0%" in found.verdict.sentence
+    assert Ahead.of(errors, 4, 1, surface).verdict.colour != "green"
+    assert Ahead.of(errors, 4, 4, replace(surface, points=20)).verdict.colour == "red"
+
+
+def test_a_finished_surface_is_held_against_its_images_from_what_was_kept_of_them():
+    """Points of one side that are farther together bend every keyframe, and the images see it."""
+    frames = colon(0, 6, 10.0, Pinhole(128, 96, 70.0, 70.0, 64.0, 48.0)).frames
+    submap = slam(frames, spurious=0.05, points_per_keyframe=120).map.submaps[0]
+    right = fed(Densifier(truth), frames, submap)
+    wrong = fed(Densifier(truth), frames, side_moved(submap, 1.1))
+    good, bad = (Finished.of(live).by_images for live in (right, wrong))
+    assert good.points > 60 and good.median_met < 0.03 and bad.median_met > 1.25 * good.median_met
+    assert Densifier(truth, LiveConfig(judge=AheadConfig(parallax=ParallaxConfig(on=False)))).seen() == {}
 
 
 def test_medians_run_over_all_keyframes_so_far():

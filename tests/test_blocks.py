@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lightdepth.blocks import wall_blocks, wall_folds
+from lightdepth.blocks import hidden_in_turn, wall_blocks, wall_folds
 
 
 @pytest.fixture
@@ -46,3 +46,11 @@ def test_a_small_wall_still_has_a_block_for_every_fold(wall):
 
 def test_one_point_is_one_block():
     assert wall_folds(np.zeros((1, 3)), 1.0).tolist() == [0]
+
+
+def test_each_fold_is_hidden_once_and_what_is_no_fold_never():
+    folds = np.array([2, 0, -1, 2, 5])
+    turns = [(hidden.tolist(), used.tolist()) for hidden, used in hidden_in_turn(folds)]
+    assert [hidden for hidden, _ in turns] == [[f == fold for f in folds.tolist()] for fold in (0, 2, 5)]
+    assert all(used == [not h for h in hidden] for hidden, used in turns)
+    assert [hidden.sum() for hidden, _ in hidden_in_turn(folds, (1, 2))] == [0, 2]

@@ -11,6 +11,7 @@ from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
 from densify.densified import Densified
 from densify.fusion.volume import FusionConfig
+from densify.judgement import Judge
 from densify.judging.brake import Tried, kept
 from densify.judging.columns import Columns
 from densify.judging.config import JudgeConfig
@@ -205,6 +206,19 @@ def test_a_better_map_is_proposed_where_the_images_speak_against_it_and_only_the
 def test_the_verdict_on_a_run_is_that_of_its_worst_map():
     green, red = Verdict("green", "a"), Verdict("red", "b")
     assert worst([green, red, green]) is red and worst([]) is None
+
+
+def test_of_maps_of_one_colour_the_one_that_is_farther_off_speaks_and_its_judge_with_it():
+    near, far = (known(surface=Withheld(500, m, 0.3, 0.0, m)).verdict for m in (0.07, 0.11))
+    by_map = known(surface=None, hidden=Withheld(500, 0.09, 0.3, 0.0, 0.09)).verdict
+    assert {v.colour for v in (near, by_map, far)} == {"amber"}
+    assert worst([near, by_map, far]) is far and (far.number, far.judge) == (0.11, "images")
+    assert worst([near, by_map]) is by_map and by_map.judge == "map"
+
+
+def test_a_judge_that_is_switched_off_hides_nothing(submap, monkeypatch):
+    monkeypatch.setattr("densify.judgement.submap_folds", lambda *_: pytest.fail("blocks were drawn"))
+    assert Judge(submap, DensifyConfig(judge=JudgeConfig(on=False))).braked([]) == []
 
 
 def test_a_doubtful_pairing_of_frames_and_map_is_never_green():

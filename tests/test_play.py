@@ -42,7 +42,7 @@ def test_maps_and_keyframes_come_in_the_order_of_the_recording():
     frames, found, _ = setting(maps=2, count=6)
     backward = replace(found.map, submaps=found.map.submaps[::-1])
     surfaces = []
-    played = play(sequence(frames), backward, DECLINE, COARSE, surfaces.append)
+    played = play(sequence(frames), backward, DECLINE, COARSE, lambda done: surfaces.append(done.dense))
     assert [p.map for p in played] == [0] * 3 + [1] * 5
     assert [d.submap.id for d in surfaces] == [0, 1] and all(len(d.triangles) for d in surfaces)
     assert all(set(p.times) == {"read", *STEPS} for p in played)
@@ -60,7 +60,7 @@ def test_a_frame_that_is_lost_or_broken_is_said_and_the_others_go_on():
 
     broken = FrameSequence([f.name for f in frames[:4]], load, "the folder")
     surfaces = []
-    played = play(broken, found.map, DECLINE, config, surfaces.append)
+    played = play(broken, found.map, DECLINE, config, lambda done: surfaces.append(done.dense))
     assert {p.keyframe: p.reason for p in played if p.unread} == {
         "000002.png": "000002: not a readable image; copy it again",
         "000004.png": "the folder: no frame number 4; expected the frames that the map was made of",
@@ -179,7 +179,9 @@ def test_a_screening_in_small_ends_with_a_surface_for_every_submap_and_memory_fo
     few = [replace(k, pixels=k.pixels[:5], point_ids=k.point_ids[:5]) for k in poor.keyframes]
     submaps = (found.map.submaps[0], replace(poor, keyframes=tuple(few)), found.map.submaps[2])
     surfaces = []
-    played = play(sequence(frames), replace(found.map, submaps=submaps), DECLINE, COARSE, surfaces.append)
+    played = play(
+        sequence(frames), replace(found.map, submaps=submaps), DECLINE, COARSE, lambda done: surfaces.append(done.dense)
+    )
     assert len(played) == 9 and [len(d.triangles) > 0 for d in surfaces] == [True, False, True]
     assert all("at least 8" in p.reason for p in played[3:6])
     unpacked = frames[0].image.nbytes + frames[0].true_distance.nbytes

@@ -14,8 +14,10 @@ from densify.config import DensifyConfig
 from densify.coverage import CoverageConfig, seen_well
 from densify.dense_map import DenseMap, read_dense_map
 from densify.judging.config import JudgeConfig
+from densify.judging.images import Seen
 from densify.pipeline import densify
 from densify.trust import coarse_sigma, expected_error
+from lightdepth.observations import ObservedDistances
 from lightdepth.sparse_map import Submap
 
 FRAMES = colon(3).frames
@@ -77,6 +79,35 @@ def test_wall_beside_points_that_the_surface_does_not_meet_is_trusted_less(dense
     there = dense.vertices[:, 0] > np.quantile(submap.points[:, 0], 0.75)
     elsewhere = dense.vertices[:, 0] < np.quantile(submap.points[:, 0], 0.25)
     assert np.median(ratio[there]) > 1.5 and np.median(ratio[elsewhere]) == pytest.approx(1, abs=0.1)
+
+
+def told(dense: DenseMap, farther: float, pixels: int = 40) -> dict[str, Seen]:
+    """What images would tell whose parallax puts the wall as far as the surface, and `farther` times as far where x is
+    above the middle of the map."""
+    found = {}
+    rng = np.random.default_rng(0)
+    for k in dense.submap.keyframes:
+        at = rng.uniform(0, 1, (pixels, 2)) * (k.camera.width, k.camera.height)
+        rays, valid = k.camera.unproject(at)
+        hit = dense.surface.cast(k.center, rays @ k.cam_from_map[:3, :3])
+        far = (k.center + np.where(np.isfinite(hit), hit, 0)[:, None] * (rays @ k.cam_from_map[:3, :3]))[:, 0]
+        mapped = np.where(far > np.median(dense.submap.points[:, 0]), farther, 1.0) * hit
+        seen = ObservedDistances(np.arange(pixels), mapped, hit, at, rays).subset(valid & np.isfinite(hit))
+        half = np.arange(len(seen)) % 2 == 0
+        found[k.name] = Seen(seen.subset(half), seen.subset(~half))
+    return found
+
+
+def test_wall_that_the_images_put_elsewhere_is_trusted_less(dense):
+    agreed, moved = (expected_error(dense, {}, told(dense, factor)) for factor in (1.0, 1.2))
+    there = dense.vertices[:, 0] > np.quantile(dense.submap.points[:, 0], 0.75)
+    elsewhere = dense.vertices[:, 0] < np.quantile(dense.submap.points[:, 0], 0.25)
+    assert np.median((moved / agreed)[there]) > 1.5
+    assert np.median((moved / agreed)[elsewhere]) == pytest.approx(1, abs=0.1)
+
+
+def test_a_few_pixels_of_the_images_are_not_asked(dense):
+    np.testing.assert_array_equal(expected_error(dense, {}, told(dense, 1.2, 2)), expected_error(dense, {}))
 
 
 def test_a_unit_changes_lengths_and_no_confidence(dense):

@@ -1,20 +1,22 @@
-"""Agreement with the map ahead: a live surface held against points that the map measures only later.
+"""A live surface held against points that the map measures only later and, once it is finished, against the images.
 
 A keyframe brings points that no keyframe before it observed. The last aligned one has seen the wall there and said how
 far it is, before these points could bend it: the share by which it is off, seen from there, is asked four ways
-(densify.judging.columns). No truth, and no second look: the map's own drift is in points and surface alike.
+(densify.judging.columns). That is no second look: the map's own drift is in points and surface alike. So where the
+last keyframe of a submap is done, distances by parallax between its images judge the surface as they judge densify's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from densify.judging.columns import WAYS, Columns
-from densify.judging.verdict import Verdict, ahead_verdict
+from densify.judging.verdict import Asked, Verdict, ahead_verdict, spoke
 from densify.judging.withheld import Withheld
+from lightdepth.parallax import ParallaxConfig
 
 _DELIVERED = len(WAYS)
 NOTHING = np.zeros((0, _DELIVERED + 1))
@@ -23,16 +25,19 @@ NOTHING = np.zeros((0, _DELIVERED + 1))
 
 @dataclass(frozen=True)
 class AheadConfig:
-    """Whether a live surface is held against the points that come after it."""
+    """How a live surface is judged: by the points that come after it and, when it is finished, by the images."""
 
     on: bool = True
     """true: the points that a keyframe is the first to observe judge the depth of the last aligned keyframe before it,
     and the run has a verdict. false: it has none, and a keyframe takes up to a tenth less time."""
+    parallax: ParallaxConfig = field(default_factory=ParallaxConfig)
+    """how distances are measured between the images of keyframes, after the last one of a submap
+    (--judge.parallax.on false leaves them out; nothing is then green)"""
 
 
 @dataclass(frozen=True)
 class Ahead:
-    """What new points of a submap say of the depth that was there before them."""
+    """What new points of a submap say of the depth that was there before them, and the images of its surface."""
 
     columns: Columns
     """the four ways at the same points"""
@@ -42,27 +47,40 @@ class Ahead:
     """number of keyframes that came"""
     aligned: int
     """number of those that were aligned"""
+    surface: Withheld | None = None
+    """the finished surface against distances by parallax; None where the images are silent or were not asked"""
 
     @classmethod
-    def of(cls, errors: Sequence[np.ndarray], keyframes: int, aligned: int) -> Ahead:
+    def of(cls, errors: Sequence[np.ndarray], keyframes: int, aligned: int, surface: Withheld | None = None) -> Ahead:
         """Of errors (n, 5) of keyframes, as AheadJudge gives them."""
         together = np.concatenate([NOTHING, *errors])
         of_ways = Columns.of([together[:, :_DELIVERED]])
-        return cls(of_ways, Withheld.of_errors(together[:, _DELIVERED]), keyframes, aligned)
+        return cls(of_ways, Withheld.of_errors(together[:, _DELIVERED]), keyframes, aligned, surface)
+
+    @property
+    def judge(self) -> Asked:
+        """Whose word the number is."""
+        return "images" if spoke(self.surface) else "map"
 
     @property
     def number(self) -> float:
-        """The median share by which the fused depth is off."""
+        """The program's own estimate of the surface's error: what the images say, else `by_points`."""
+        met = self.surface.median_met if self.judge == "images" and self.surface is not None else self.by_points
+        return float("inf") if met is None else met
+
+    @property
+    def by_points(self) -> float:
+        """The median share by which the fused depth is off at new points."""
         return float("inf") if self.delivered is None else self.delivered.median
 
     @property
     def verdict(self) -> Verdict:
-        return ahead_verdict(self.columns, self.number, self.keyframes, self.aligned)
+        return ahead_verdict(self.columns, self.by_points, self.surface, self.keyframes, self.aligned)
 
     def record(self) -> dict[str, object]:
         """For run.json."""
-        delivered = None if self.delivered is None else self.delivered.record()
-        return {"new_points": self.columns.record(), "delivered": delivered}
+        delivered, surface = (None if w is None else w.record() for w in (self.delivered, self.surface))
+        return {"new_points": self.columns.record(), "delivered": delivered, "surface": surface}
 
 
 def running(errors: Sequence[np.ndarray]) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 from densify.agreement import AgreementConfig, View, agree
 from densify.alignment import AlignmentConfig, align
 from densify.bending import Bend, BendingConfig
+from lightdepth.blocks import hidden_in_turn
 from lightdepth.observations import ObservedDistances
 
 WAYS = ("one_scale", "bent", "constant_one_scale", "constant_bent")
@@ -117,11 +118,10 @@ def hidden_ratios(view: View, fold: np.ndarray, method: Method) -> np.ndarray:
     hidden."""
     o = view.observed
     ratios = np.full((len(o), len(WAYS)), np.nan)
-    for hidden in np.unique(fold[fold >= 0]):
-        rows = fold == hidden
-        if (~rows).sum() >= method.alignment.min_points:
-            used = replace(view, observed=o.subset(~rows))
-            ratios[rows] = FourWays.of(used, method).ratios(o.subset(rows))
+    for hidden, others in hidden_in_turn(fold):
+        if others.sum() >= method.alignment.min_points:
+            used = replace(view, observed=o.subset(others))
+            ratios[hidden] = FourWays.of(used, method).ratios(o.subset(hidden))
     return ratios
 
 

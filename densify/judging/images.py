@@ -27,6 +27,11 @@ class Seen:
     deciding: ObservedDistances
     judging: ObservedDistances
 
+    @property
+    def every(self) -> ObservedDistances:
+        """Both halves, for what neither has decided."""
+        return self.deciding.with_others(self.judging)
+
 
 class Images:
     """Collects the keyframes of a submap, small, and measures distances between them."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,8 @@ from densify.judging.doubts import Doubts
 from densify.judging.withheld import Withheld
 
 Colour = Literal["green", "amber", "red"]
+Asked = Literal["", "images", "map"]
+"""Who a verdict's number is from: the images' parallax, or the map's own points where the images are silent."""
 
 GREEN, RED = 0.065, 0.125
 """Disagreement, as a share of the distance, up to which a surface is green and from which it is red."""
@@ -54,10 +56,15 @@ class Judgement:
     def number(self) -> float:
         """The program's own estimate of the surface's error, as a share of the distance: what the images say, or the
         map where they are silent. Not an error: that takes truth."""
-        if self.surface is not None and self.surface.points >= _LEAST:
+        if self.judge == "images" and self.surface is not None:
             met = self.surface.median_met
             return float("inf") if met is None else met
         return self.hidden.median if self.hidden is not None else float("inf")
+
+    @property
+    def judge(self) -> Asked:
+        """Whose word the number is."""
+        return "images" if spoke(self.surface) else "map"
 
     @property
     def verdict(self) -> Verdict:
@@ -99,6 +106,11 @@ class Verdict:
 
     colour: Colour
     sentence: str
+    number: float = float("inf")
+    """share of the distance by which the judge puts the wall from the surface, in the median; infinite where none can
+    say"""
+    judge: Asked = ""
+    """whose word the number is; empty where nobody could be asked"""
 
     def __str__(self) -> str:
         return f"{self.colour}: {self.sentence}"
@@ -109,7 +121,7 @@ def proposal(j: Judgement) -> str:
 
     That the map's error and not the light's is what they see, they cannot tell: it may help, and is soon tried.
     """
-    if j.surface is None or j.surface.points < _LEAST:
+    if not spoke(j.surface):
         return ""
     if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
         seen = "its points bend the depth against the images"
@@ -121,9 +133,25 @@ def proposal(j: Judgement) -> str:
 
 
 def worst(verdicts: Sequence[Verdict]) -> Verdict | None:
-    """The verdict on a run: the worst of its submaps'."""
+    """The verdict on a run: the worst of its submaps', of equal colours the one with the larger number."""
     order = ("green", "amber", "red")
-    return max(verdicts, key=lambda v: order.index(v.colour), default=None)
+    return max(verdicts, key=lambda v: (order.index(v.colour), v.number), default=None)
+
+
+def spoke(surface: Withheld | None) -> bool:
+    """Whether the images say enough of a surface to judge it by."""
+    return surface is not None and surface.points >= _LEAST
+
+
+def _by_images(surface: Withheld) -> tuple[str, list[str], list[str]]:
+    """What the images say of a surface, and which of it makes it red, and amber."""
+    number = float("inf") if surface.median_met is None else surface.median_met
+    said = f"the images' parallax puts the wall {_share(number)} from the surface in the median"
+    said += f" ({surface.points} pixels)"
+    red, amber = ([said], []) if number > RED else ([], [said] if number > GREEN else [])
+    if surface.miss > _MISSES:
+        amber.append(f"{surface.miss:.0%} of what they see is not on the surface")
+    return said, red, amber
 
 
 def doubted(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
@@ -131,30 +159,21 @@ def doubted(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
     if not doubts:
         return verdict
     colour: Colour = "red" if verdict.colour == "red" else "amber"
-    return Verdict(colour, "; ".join([*doubts, verdict.sentence]))
+    return replace(verdict, colour=colour, sentence="; ".join([*doubts, verdict.sentence]))
 
 
 def _verdict(j: Judgement) -> Verdict:
-    spoke = j.surface.points if j.surface is not None else 0
     number = j.number
     if not j.aligned:
         return Verdict("red", "no keyframe could be aligned")
-    red, amber = [], []
-    if spoke >= _LEAST and j.surface is not None:
-        said = f"the images' parallax puts the wall {_share(number)} from the surface in the median ({spoke} pixels)"
-        if number > RED:
-            red.append(said)
-        elif number > GREEN:
-            amber.append(said)
-        if j.surface.miss > _MISSES:
-            amber.append(f"{j.surface.miss:.0%} of what they see is not on the surface")
+    if j.surface is not None and spoke(j.surface):
+        said, red, amber = _by_images(j.surface)
     else:
         said = "the images have too little texture or parallax to judge by"
-        amber.append(f"{said}; hidden blocks of the map's wall are {_share(number)} off")
+        red, amber = [], [f"{said}; hidden blocks of the map's wall are {_share(number)} off"]
         if not number <= RED:
             red.append(f"hidden blocks of the map's wall are {_share(number)} off, and the images say nothing")
-    if 2 * j.aligned < j.keyframes:
-        amber.append(f"only {j.aligned} of {j.keyframes} keyframes could be aligned")
+    amber += _few(j.keyframes, j.aligned)
     light = j.images if j.images.count >= _LEAST else j.blocks
     remarks = []
     if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
@@ -164,29 +183,48 @@ def _verdict(j: Judgement) -> Verdict:
         )
     remarks += _no_merit(light)
     if red:
-        return Verdict("red", "; ".join(red + amber + remarks))
+        return Verdict("red", "; ".join(red + amber + remarks), number, j.judge)
     if amber:
-        return Verdict("amber", "; ".join(amber + remarks))
+        return Verdict("amber", "; ".join(amber + remarks), number, j.judge)
     remarks.append(f"{j.aligned} of {j.keyframes} keyframes aligned")
-    return Verdict("green", "; ".join([said, *remarks]))
+    return Verdict("green", "; ".join([said, *remarks]), number, j.judge)
 
 
-def ahead_verdict(columns: Columns, number: float, keyframes: int, aligned: int) -> Verdict:
-    """On a live surface, by points that the map measured after it; `number` is the median share by which they are off.
+def ahead_verdict(
+    columns: Columns, by_points: float, surface: Withheld | None, keyframes: int, aligned: int
+) -> Verdict:
+    """On a live surface: by the images, as on densify's; where they say nothing, by points that the map measured after
+    it, `by_points` being the median share by which they are off.
 
-    The map alone judges, so that nothing is green: points and surface may have drifted together.
+    Where the map alone judges nothing is green: points and surface may have drifted together.
     """
     if not aligned:
         return Verdict("red", "no keyframe could be aligned")
-    few = [f"only {aligned} of {keyframes} keyframes could be aligned"] if 2 * aligned < keyframes else []
+    few = _few(keyframes, aligned)
+    merit = _no_merit(columns) if columns.count >= _LEAST else []
+    if surface is not None and spoke(surface):
+        said, red, amber = _by_images(surface)
+        colour: Colour = "red" if red else "amber" if amber or few else "green"
+        number = float("inf") if surface.median_met is None else surface.median_met
+        told = [*dict.fromkeys([said, *red, *amber]), *few]
+        if columns.count >= _LEAST:
+            told.append(f"new points of the map were {_share(by_points)} from the depth before them")
+        return Verdict(colour, "; ".join([*told, *merit]), number, "images")
     if columns.count < _LEAST:
-        return Verdict("amber", "; ".join([f"{columns.count} new points are too few to judge by", *few]))
+        told = [f"{columns.count} new points are too few to judge by, and the images say nothing", *few]
+        return Verdict("amber", "; ".join(told))
     said = (
-        f"new points of the map are {_share(number)} from the depth that was there before them, in the median "
+        f"new points of the map are {_share(by_points)} from the depth that was there before them, in the median "
         f"({columns.count} points; a constant distance {_share(columns.constant)})"
     )
-    colour: Colour = "red" if number > RED else "amber"
-    return Verdict(colour, "; ".join([said, "the map alone was asked, not the images", *few, *_no_merit(columns)]))
+    alone = "the map alone was asked, not the images"
+    colour = "red" if by_points > RED else "amber"
+    return Verdict(colour, "; ".join([said, alone, *few, *merit]), by_points, "map")
+
+
+def _few(keyframes: int, aligned: int) -> list[str]:
+    """A reason for amber where most keyframes have no part in the surface."""
+    return [f"only {aligned} of {keyframes} keyframes could be aligned"] if 2 * aligned < keyframes else []
 
 
 def _no_merit(columns: Columns) -> list[str]:

@@ -1,6 +1,9 @@
-"""Asks each keyframe's new points what they say of the depth that was there before them (densify.judging.ahead)."""
+"""Asks each keyframe's new points what they say of the depth that was there before them (densify.judging.ahead), and
+the images of all keyframes, once they are there, what they say of the surface."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -9,8 +12,12 @@ from densify.aligned import AlignedKeyframe
 from densify.config import MethodConfig
 from densify.judging.ahead import NOTHING
 from densify.judging.columns import FourWays, Method
+from densify.judging.images import Images, Seen
+from densify.live.packed import PackedView
+from lightdepth.frame import Frame
 from lightdepth.observations import ObservedDistances
-from lightdepth.sparse_map import Keyframe
+from lightdepth.parallax import ParallaxConfig
+from lightdepth.sparse_map import Keyframe, Submap
 
 
 class AheadJudge:
@@ -66,3 +73,13 @@ def _measured(view: View, place: Keyframe, ids: np.ndarray, points: np.ndarray) 
     rays = in_camera / np.maximum(mapped, 1e-12)[:, None]
     found = ObservedDistances(ids, mapped, np.exp(log_predicted), pixels, rays)
     return found.subset(seen & known & (mapped > 0))
+
+
+def images_of(views: Mapping[str, PackedView], submap: Submap, config: ParallaxConfig) -> dict[str, Seen]:
+    """What the images of keyframes tell of distances, by name, from what is kept of them."""
+    images = Images(config)
+    for keyframe in submap.keyframes:
+        view = views[keyframe.name]
+        prediction = view.prediction()
+        images.see(keyframe, Frame(keyframe.name, view.image(), keyframe.camera, mask=prediction.valid), prediction)
+    return images.measure(submap)

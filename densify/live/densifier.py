@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -28,7 +29,9 @@ from densify.fusion.marching_cubes import unpacked
 from densify.fusion.patches import BlockSurface, Patch, joined
 from densify.fusion.rectify import SurfaceView
 from densify.fusion.volume import TsdfVolume
-from densify.live.ahead import AheadJudge
+from densify.judging.ahead import AheadConfig
+from densify.judging.images import Seen
+from densify.live.ahead import AheadJudge, images_of
 from densify.live.packed import PackedView, Packing
 from densify.predictions import Predictor, SeenKeyframe
 from lightdepth.camera import CameraModel
@@ -106,8 +109,9 @@ class Densifier:
         self.times: dict[str, StepTime] = {}
         self.ahead: list[np.ndarray] = []
         """errors of earlier depth at the new points of each keyframe, as densify.judging.ahead.Ahead takes them"""
-        judged = not isinstance(config, LiveConfig | DensifyConfig) or config.judge.on
-        self._judge = AheadJudge(config, judged)
+        judge = config.judge if isinstance(config, LiveConfig | DensifyConfig) else AheadConfig()
+        self._judge = AheadJudge(config, judge.on)
+        self._parallax = replace(judge.parallax, on=judge.on and judge.parallax.on)
         self._model = model
         self._light, self._mask = light or PhotometricCalibration(), mask
         self._kept: dict[str, _Kept] = {}
@@ -248,8 +252,20 @@ class Densifier:
                 self._surface.renew(self._volume, changed)
         return LiveMesh(self._surface.patches, unpacked(self._surface.renewed))
 
-    def dense_map(self) -> DenseMap:
-        """The surface with all that it rests on, as densify makes it. Raises InputError while there is no keyframe."""
+    def seen(self) -> dict[str, Seen]:
+        """What the images of the keyframes tell of distances, by keyframe; nothing where the judge is switched off. It
+        takes some 0.15 s a keyframe, so it is for the end. Raises InputError while there is no keyframe."""
+        views = {name: kept.view for name, kept in self._kept.items()}
+        return images_of(views, self._submap(), self._parallax) if self._parallax.on else {}
+
+    def dense_map(self, seen: Mapping[str, Seen] = MappingProxyType({})) -> DenseMap:
+        """The surface with all that it rests on, as densify makes it; what its images tell, where `seen` was asked, is
+        in its confidence. Raises InputError while there is no keyframe."""
+        volume = TsdfVolume(1.0, self.config.fusion) if self._volume is None else self._volume
+        given = {k.keyframe.name: k.given for k in self._kept.values() if k.given}
+        return with_contributions(DenseMap.of(volume, self._submap(), self.alignments), given, seen)
+
+    def _submap(self) -> Submap:
         if not self._kept:
             raise InputError(f"map {self.id}", "no keyframe yet", "add one first")
         keyframes = tuple(kept.keyframe for kept in self._kept.values())
@@ -257,10 +273,7 @@ class Densifier:
         ids = np.concatenate([k.point_ids for k in keyframes])[::-1]
         points = np.concatenate([kept.points for kept in self._kept.values()])[::-1]
         ids, first = np.unique(ids, return_index=True)
-        submap = Submap(self.id, keyframes, ids, points[first])
-        volume = TsdfVolume(1.0, self.config.fusion) if self._volume is None else self._volume
-        given = {k.keyframe.name: k.given for k in self._kept.values() if k.given}
-        return with_contributions(DenseMap.of(volume, submap, self.alignments), given)
+        return Submap(self.id, keyframes, ids, points[first])
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:

@@ -30,14 +30,18 @@ def _agreement(page: Report, judged: Mapping[int, Ahead], played: Sequence[Playe
         "How far the depth of the last aligned keyframe is from points that the map measured after it, as a share, in "
         "the median. This is agreement, not error: map and surface may have drifted together. New points lie beside "
         "points that were used, at the rim of what was known. A constant distance gets the same help, one scale or a "
-        "bend, and is asked at the same points."
+        "bend, and is asked at the same points. When a surface is finished, the images are asked as well: distances by "
+        "parallax between its keyframes, which nothing was fitted to. Where they speak, the verdict is by them."
     )
     rows = []
     for number, found in judged.items():
         c = found.columns
         ways = [c.one_scale, c.bent, c.constant_one_scale, c.constant_bent]
-        rows.append([f"map {number}", c.count, found.number, *ways])
+        asked = found.surface
+        images = [asked.points if asked else 0, asked.median_met if asked and asked.median_met is not None else "-"]
+        rows.append([f"map {number}", c.count, found.by_points, *ways, *images])
     headers = ["", "new points", "as fused", "one scale", "bent", "constant, one scale", "constant, bent"]
+    headers += ["pixels of the images", "surface from them"]
     page.table(headers, rows)
     for number, found in judged.items():
         page.text(f"Map {number}: {found.verdict}.")

@@ -17,6 +17,7 @@ import numpy as np
 from densify.config import MethodConfig
 from densify.dense_map import DenseMap
 from densify.judging.ahead import NOTHING, Ahead
+from densify.judging.withheld import Withheld
 from densify.live.densifier import STEPS, Densifier, StepTime
 from densify.predictions import Predictor
 from lightdepth.datasets import FrameSequence
@@ -51,19 +52,36 @@ class Played:
         return sum(self.times.values(), StepTime())
 
 
+@dataclass(frozen=True)
+class Finished:
+    """A submap's surface when its last keyframe is done, and how far it is from distances by parallax between its
+    images; None where they were not asked or said nothing."""
+
+    dense: DenseMap
+    by_images: Withheld | None = None
+
+    @classmethod
+    def of(cls, densifier: Densifier) -> Finished:
+        seen = densifier.seen()
+        dense = densifier.dense_map(seen)
+        told = [(k, seen[k.name].every) for k in dense.submap.keyframes if k.name in seen]
+        return cls(dense, Withheld.of(dense, told))
+
+
 def play(
     frames: FrameSequence,
     sparse_map: SparseMap,
     model: Predictor,
     config: MethodConfig,
-    on_map: Callable[[DenseMap], None],
+    on_map: Callable[[Finished], None],
     rate: float | None = None,
     on_keyframe: Callable[[Played], None] | None = None,
 ) -> list[Played]:
     """All keyframes, one by one; `on_map` is given each submap's surface when its last keyframe is done.
 
     With `rate` [keyframes per second] the n-th keyframe is not there before n / rate seconds, and waits while an
-    earlier one is worked on; without, each comes when the last is done. Only one submap is held at a time.
+    earlier one is worked on; without, each comes when the last is done. The clock stands still while a finished surface
+    is judged by its images. Only one submap is held at a time.
     """
     if rate is not None and not rate > 0:
         raise InputError("rate", f"{rate}", "expected keyframes per second, above 0")
@@ -82,8 +100,11 @@ def play(
             if on_keyframe is not None:
                 on_keyframe(played[-1])
         if densifier.alignments:
-            dense = densifier.dense_map()
-            on_map(replace(dense, submap=replace(dense.submap, origin=submap.origin)))
+            began = time.perf_counter()
+            done = Finished.of(densifier)
+            start += time.perf_counter() - began  # nothing waits for it: the next submap need not
+            submap_there = replace(done.dense.submap, origin=submap.origin)
+            on_map(replace(done, dense=replace(done.dense, submap=submap_there)))
     return played
 
 

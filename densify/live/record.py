@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 from densify.coverage import Coverage, CoverageConfig
 from densify.coverage import coverage as coverage_of
-from densify.dense_map import DenseMap
 from densify.judging.ahead import Ahead
 from densify.judging.verdict import doubted, worst
+from densify.judging.withheld import Withheld
 from densify.live.page import live_page
-from densify.live.play import Played, time_spent, timings_picture, write_timings
+from densify.live.play import Finished, Played, time_spent, timings_picture, write_timings
 from lightdepth.errors import InputError
 from lightdepth.reporting.run import Run, plain
 
@@ -32,6 +32,8 @@ class _MapRecord:
     """edge of a voxel, map units"""
     coverage: Coverage | None
     """how well it was seen; None for an empty one"""
+    by_images: Withheld | None
+    """the surface against distances by parallax; None where the images said nothing"""
 
     def record(self) -> dict[str, object]:
         """For run.json."""
@@ -40,8 +42,8 @@ class _MapRecord:
         return {**counts, "voxel": self.voxel, **seen}
 
     def judged(self, played: Sequence[Played]) -> Ahead:
-        """What new points of the map say of it."""
-        return Ahead.of([p.ahead for p in played if p.map == self.map], self.keyframes, self.aligned)
+        """What new points of the map and the images say of it."""
+        return Ahead.of([p.ahead for p in played if p.map == self.map], self.keyframes, self.aligned, self.by_images)
 
 
 class PlayedRun:
@@ -60,11 +62,12 @@ class PlayedRun:
         self._doubts = doubts
         self._records: list[_MapRecord] = []
 
-    def add(self, dense: DenseMap) -> None:
+    def add(self, done: Finished) -> None:
         """Writes the surface of a submap whose last keyframe is done; an empty one is a failed part of the run."""
+        dense = done.dense
         scale, counts = self._mm_per_unit, (len(dense.alignments), len(dense.aligned), len(dense.vertices))
         seen = coverage_of(dense, self._coverage).scaled(scale or 1.0) if len(dense.triangles) else None
-        self._records.append(_MapRecord(dense.submap.id, *counts, dense.voxel, seen))
+        self._records.append(_MapRecord(dense.submap.id, *counts, dense.voxel, seen, done.by_images))
         name = f"map_{dense.submap.id:03d}"
         if not len(dense.triangles):
             self._run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))

@@ -14,7 +14,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from lightdepth.blocks import submap_folds
+from lightdepth.blocks import hidden_in_turn, submap_folds
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 from lightdepth.decline import V_FLOOR
@@ -135,8 +135,8 @@ def hidden_error(
         predictions = {
             light: [model(replace(view.frame, light=light)) for view in of_map] for light in dict.fromkeys(lights)
         }
-        for fold, light in zip(range(FOLDS), lights, strict=True):
-            seen, judging = zip(*(parted(view, fold_of == fold) for view in of_map), strict=True)
+        for (hidden, _), light in zip(hidden_in_turn(fold_of, range(FOLDS)), lights, strict=True):
+            seen, judging = zip(*(parted(view, hidden) for view in of_map), strict=True)
             known = replace(of_map[0].submap, keyframes=tuple(view.keyframe for view in seen))
             placed = place(known, predictions[light])
             for view, prediction, found in zip(judging, predictions[light], placed, strict=True):

@@ -161,7 +161,7 @@ def test_a_screening_of_5000_frames_and_19_submaps():
         SparseMap(tuple(submaps), "screening"),
         pipe.predict,
         COARSE,
-        lambda dense: surfaces.append((len(dense.vertices), len(dense.aligned))),
+        lambda done: surfaces.append((len(done.dense.vertices), len(done.dense.aligned))),
     )
     cpu = np.array([p.total.cpu for p in played if not p.reason])
     wall = np.array([p.total.wall for p in played if not p.reason])

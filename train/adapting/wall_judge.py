@@ -20,13 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from lightdepth.blocks import BLOCK_SIZE, submap_folds, wall_blocks
+from lightdepth.blocks import hidden_in_turn, submap_blocks, submap_folds
 from lightdepth.datasets import FrameSequence
 from lightdepth.light.views import LightView, map_views
 from lightdepth.models import DepthModel
 from lightdepth.observations import ObservedDistances, observed_distances
 from lightdepth.robust import lmeds_scale
-from lightdepth.sparse_map import SparseMap, Submap, typical_distance
+from lightdepth.sparse_map import SparseMap, Submap
 
 from .map_teacher import LEAST_POINTS
 
@@ -162,16 +162,15 @@ def compared(before: WallErrors, after: WallErrors) -> Change | None:
 
 def _parted(submap: Submap, seed: int) -> Parted:
     folds = submap_folds(submap, FOLDS, seed)
-    blocks = FOLDS * wall_blocks(submap.points, BLOCK_SIZE * typical_distance(submap), seed) + folds
+    blocks = FOLDS * submap_blocks(submap, seed) + folds
     return Parted(np.where(np.bincount(blocks)[blocks] >= _POINTS, blocks, -1), folds)
 
 
 def _errors(observed: ObservedDistances, folds: np.ndarray, judging: Sequence[int]) -> np.ndarray:
     """|log a - log s t| (n,) of the points of the judging folds, s by the points of the others; NaN elsewhere."""
     errors = np.full(len(observed), np.nan)
-    for fold in judging:
-        judged = folds == fold
-        others = ~judged if (~judged).sum() >= LEAST_POINTS else np.ones(len(judged), bool)
+    for judged, others in hidden_in_turn(folds, judging):
+        others = others if others.sum() >= LEAST_POINTS else np.ones(len(judged), bool)
         scale = lmeds_scale(observed.mapped[others], observed.predicted[others]).scale
         errors[judged] = np.abs(np.log(observed.mapped[judged] / (scale * observed.predicted[judged])))
     return errors
