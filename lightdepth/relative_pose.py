@@ -121,7 +121,8 @@ def pixels_per_radian(camera: CameraModel) -> float:
 
 def _inside(pixels: np.ndarray, look: Look, margin: float) -> np.ndarray:
     height, width = look.usable.shape
-    result: np.ndarray = ((pixels > margin) & (pixels < (width - margin, height - margin))).all(1)
+    low, high = pixels - margin, np.array([width, height]) - margin - pixels
+    result: np.ndarray = np.minimum(low, high).min(1) > 0
     return result
 
 
