@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from lightdepth.camera import CameraModel
 from lightdepth.parallax import Look, ParallaxConfig, textured
 
-_LEAST_TRACKS = 20
+_LEAST_TRACKS = 40
 _TURN, _DIRECTION = np.radians(1.0), np.radians(4.0)  # how far off a map's neighbours are expected to be, one sigma
 _TRACKING = 0.7  # pixels
 _MENDED = 0.6  # a correction must leave at most this share of the distance from the lines

@@ -113,7 +113,7 @@ def test_the_last_tenth_of_a_sequence_is_held_out_unless_there_are_validation_se
 def test_nothing_to_train_on_is_said():
     with refused(cure="data.sequences"):
         FrameDataModule(FrameData()).setup()
-    with refused(cure="val_scenes"):
+    with refused(cure="val-scenes"):
         FrameDataModule(FrameData(tube=TubeData(scenes=1, frames=1), size=(20, 16))).setup()
 
 
