@@ -209,7 +209,7 @@ def test_the_verdict_on_a_run_is_that_of_its_worst_map():
 
 
 def test_of_maps_of_one_colour_the_one_that_is_farther_off_speaks_and_its_judge_with_it():
-    near, far = (known(surface=Withheld(500, m, 0.3, 0.0, m)).verdict for m in (0.07, 0.11))
+    near, far = (known(surface=Withheld(500, m, 0.3, 0.0, m)).verdict for m in (0.08, 0.11))
     by_map = known(surface=None, hidden=Withheld(500, 0.09, 0.3, 0.0, 0.09)).verdict
     assert {v.colour for v in (near, by_map, far)} == {"amber"}
     assert worst([near, by_map, far]) is far and (far.number, far.judge) == (0.11, "images")

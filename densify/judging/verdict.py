@@ -16,7 +16,7 @@ Colour = Literal["green", "amber", "red"]
 Asked = Literal["", "images", "map"]
 """Who a verdict's number is from: the images' parallax, or the map's own points where the images are silent."""
 
-GREEN, RED = 0.065, 0.125
+GREEN, RED = 0.07, 0.125
 """Disagreement, as a share of the distance, up to which a surface is green and from which it is red."""
 _MISSES = 0.4
 _LEAST = 60
