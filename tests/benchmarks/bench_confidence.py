@@ -77,7 +77,7 @@ def rows_of(scene: Scene, model: DepthModel) -> Iterator[Row]:
         config = SlamConfig("tracked", 1, 1, points_per_keyframe=500, spurious=WRONG_SHARE)
         gauge = simulate_slam(list(rendered.frames), config, scene.seed).map_from_world[0]
         for case in TOGETHER:
-            yield judged(f"together: {case}", rendered.tracked(WRONG_SHARE, CASES[case]), gauge=gauge)
+            yield judged(f"together: {case}", rendered.tracked(WRONG_SHARE, CASES[case].errors), gauge=gauge)
 
 
 def table(rows: list[Row]) -> Iterator[str]:
