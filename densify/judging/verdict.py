@@ -179,8 +179,8 @@ def _verdict(j: Judgement) -> Verdict:
     if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
         remarks.append(
             f"the map's points bend the depth against the images ({_share(j.images.bent)} off, one scale "
-            f"{_share(j.images.one_scale)}): they may err together; {j.undone} keyframes keep one scale, {j.lessened} a part of "
-            "their bend"
+            f"{_share(j.images.one_scale)}): they may err together; {j.undone} keyframes keep one scale, "
+            f"{j.lessened} a part of their bend"
         )
     remarks += _no_merit(light)
     if red:
