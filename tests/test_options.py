@@ -151,12 +151,6 @@ def test_help_names_other_options_in_its_sentences_with_dashes(capsys):
     assert "one_cycle climbs to learning-rate and falls" in shown  # the first is a choice, and typed so
 
 
-def test_an_option_that_there_is_not_is_told_as_it_was_typed(capsys):
-    with pytest.raises(SystemExit):
-        parsed(parsers()["sparse"], ["data", "-o", "out", "--max-frames", "3"])
-    assert "no option --max-frames;" in capsys.readouterr().err
-
-
 def test_the_documents_spell_options_with_dashes():
     for document in (ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("data/**/*.md"), ROOT / "CHANGELOG.md"):
         assert re.findall(r"--[a-z][\w.-]*_[\w.-]*", document.read_text(encoding="utf-8")) == [], document
