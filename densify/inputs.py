@@ -34,8 +34,8 @@ class MapSource(PairingConfig):
     """A sparse map, and what is asked of it."""
 
     map: Path | None = None
-    """Sparse map of the frames (poses and points of a SLAM): COLMAP model(s) or a multi-map tree; left out, pycolmap
-    makes one from the frames."""
+    """Sparse map of the frames (poses and points of a SLAM): COLMAP model(s), a multi-map tree, a stella_vslam
+    map, or a TUM trajectory with points; left out, pycolmap makes one from the frames."""
     repair_map: bool = False
     """Make the map anew before it is used, by matching the images of its keyframes, beginning at its poses and keeping
     its frame and scale; written to sparse/ in the run folder. Switched off, it is used as it is."""

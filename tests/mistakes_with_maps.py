@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -232,6 +233,19 @@ def seconds_without_fps(path):
 def milliseconds(path):
     edit_times(path, [1000 / 30, 2000 / 30, 3000 / 30])
     return lambda: check_shared_frames(read_map(path), sequence(colon(0, 3, 6.0).frames))
+
+
+@mistake("Gives frames named by times with a map of numbers", "colmap", "none in common", "the frames' names are times")
+def times_beside_numbers(path):
+    frames = sequence([replace(f, name=f"frame_{(f.number + 3) / 30:.4f}") for f in colon(0, 3, 6.0).frames])
+    return lambda: check_shared_frames(read_map(path), frames)
+
+
+@mistake("Gives the folder that an export made", "colmap", "no map in it, but in map_000", "map_000/sparse")
+def folder_above_the_maps(path):
+    model = path.parent / "exported" / "map_000" / "sparse" / "0"
+    shutil.copytree(path, model)
+    return lambda: read_map(path.parent / "exported")
 
 
 @mistake("Gives the map of another cut of the video", "tum", "1 of 3 keyframes", "in milliseconds?", refused=False)

@@ -133,6 +133,12 @@ def test_the_example_runs_without_the_program_and_gives_its_distance(kind, check
     assert np.abs(np.log(found[mask] / wanted.detach().numpy()[mask])).max() < 1e-4
 
 
+def test_the_example_without_its_words_says_which_it_takes(onnx_graph):
+    run = [sys.executable, str(onnx_graph / "example.py")]
+    done = subprocess.run(run, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "python example.py model.onnx IMAGE CAMERA.json OUT.npy [MASK]" in done.stderr
+
+
 def json_light(folder: Path) -> dict[str, float]:
     return json.loads((folder / "model.json").read_text())["light"]
 
@@ -271,6 +277,14 @@ def test_depth_goes_to_16_bit_png_and_is_read_back_by_evaluate(predictions, tmp_
 
 def truth_of(file: Path) -> np.ndarray:
     return read_prediction(file).distance
+
+
+def test_depth_of_no_stated_kind_is_refused_with_the_option_that_states_it(predictions, tmp_path, capsys):
+    assert main(["export", str(predictions), "-o", str(tmp_path / "exr"), "--to", "exr"]) == 0
+    write_folder(colon(0, 8, 9.0, FISHEYE).frames[:2], tmp_path / "data")
+    refused = ["evaluate", str(tmp_path / "exr"), "--truth", str(tmp_path / "data"), "-o", str(tmp_path / "e")]
+    assert main(refused) == 3
+    assert "do not say what their numbers are; say --depth-kind" in capsys.readouterr().err
 
 
 def test_depth_goes_to_exr_and_comes_back_by_openexr_to_the_last_bit(predictions, tmp_path):

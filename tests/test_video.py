@@ -126,6 +126,11 @@ def test_a_video_is_a_sequence_with_what_lies_beside_it(with_camera):
     assert open_sequence(with_camera, light="gamma=2.2,mu=0")[0].light.mu == 0
 
 
+def test_the_black_border_of_a_video_is_said(with_camera):
+    with pytest.warns(UserWarning, match="is a black border, which is left out"):
+        open_sequence(with_camera)
+
+
 def test_without_a_camera_a_video_is_refused_and_a_map_s_camera_serves(videos, tmp_path):
     with refused(where="a.mp4", found="no camera.json beside it", cure="give --camera FILE"):
         open_sequence(videos["mp4"])

@@ -83,11 +83,15 @@ def read_models(path: Path, trajectory: Path | None = None, reader: Reader = Rea
         except InputError as error:
             if path.is_dir() and trajectory_files(path):
                 return [JudgedMap(t) for t in read_trajectories(path, reader)]
+            if other_depth(path):
+                found = "depth files that do not say what their numbers are"
+                cure = "say --depth-kind distance, depth or disparity (depth, of what `lightdepth export` wrote)"
+                raise InputError(path, found, cure) from error
             raise InputError(
                 path,
                 "neither map_* folders (a densify run) nor .npz files (predictions) nor a trajectory, and no map: "
                 f"{error.found}",
-                error.cure + ("; if it is another program's depth, say --depth-kind" if other_depth(path) else ""),
+                error.cure,
             ) from error
         trajectory = trajectory or (path if trajectory_files(path) else None)
     return models if trajectory is None else with_trajectories(models, read_trajectories(trajectory, reader))

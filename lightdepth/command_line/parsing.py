@@ -104,7 +104,16 @@ class Parser(ArgumentParser):
         summary, _, tail = tail.partition("\n\n")
         examples = "".join(f"\n  {example}" for example in self.page.examples)
         page = f"{head}{gap}{summary}\n\nexamples:{examples}\n\n{tail}" if examples else page
-        return _OPTION.sub(lambda found: dashed(found[0]), page)
+        page = _OPTION.sub(lambda found: dashed(found[0]), page)
+        return re.sub(self._names_in_prose(), lambda found: dashed(found[0]), page)
+
+    def _names_in_prose(self) -> str:
+        """A pattern of options as sentences name them, by all of the name or by its last part; no choice is meant."""
+        names = {name for a in options(self) for name in (a.dest, a.dest.rpartition(".")[2]) if "_" in name}
+        kinds = (k for a in options(self) for k in choices_of_type(getattr(a, "_typehint", None)))
+        chosen = {str(choice) for kind in kinds for choice in literals(kind)}
+        longest_first = sorted(names - chosen, key=lambda name: (-len(name), name))
+        return rf"(?<![\w/.{{-])(?:{'|'.join(map(re.escape, longest_first)) or '(?!)'})(?![\w/]|\.\w)"
 
     def _short_usage(self) -> str:
         words = [a.dest.upper() for a in self._actions if not a.option_strings and a.help != argparse.SUPPRESS]
@@ -280,7 +289,7 @@ def _unknown(parser: Parser, word: str) -> tuple[str, str]:
         return f"{word}: nothing takes this word; options begin with --", ""
     name = word.partition("=")[0]
     nearest = closest(name.lstrip("-").replace("-", "_"), _names(parser))
-    return f"no option {name}" + (f"; did you mean --{dashed(nearest)}?" if nearest else ""), nearest
+    return f"no option {dashed(name)}" + (f"; did you mean --{dashed(nearest)}?" if nearest else ""), nearest
 
 
 def _names(parser: Parser) -> list[str]:

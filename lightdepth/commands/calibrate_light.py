@@ -36,8 +36,9 @@ def calibrate_light(
     Args:
         data: Folder of frames, or video, whose light is sought.
         output: File light.json to write, with a report beside it (light.html).
-        map: Sparse map of the frames (poses and points of a SLAM), by which the light is fitted: COLMAP model(s) or a
-            multi-map tree; left out, the frames' own true depth is needed.
+        map: Sparse map of the frames (poses and points of a SLAM), by which the light is fitted: COLMAP model(s), a
+            multi-map tree, a stella_vslam map, or a TUM trajectory with points; left out, the frames' own
+            true depth is needed.
         format: Format of the frames: folder, video, c3vd, simcol, hamlyn, scared, endoslam or endomapper; found by
             looking if left out.
         camera: Calibration file, which wins over all others; left out, the map's own camera, else the folder's.

@@ -61,7 +61,8 @@ def read_folder(
                 path,
                 "no camera.json",
                 'give --camera FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), '
-                "--camera auto to find it from the motion (--fov 70 where to start), or a map that has one",
+                "--camera auto to find it from the motion (--fov 70 where to start), or, where a verb takes --map, a "
+                "map that has one",
             )
         camera = read_camera(path / "camera.json")
         if first is not None:

@@ -15,7 +15,7 @@ from lightdepth.datasets import endomapper
 from lightdepth.datasets.clip import Clip, check_depth
 from lightdepth.datasets.clip_checks import check_clip
 from lightdepth.datasets.dicom import is_dicom, open_dicom
-from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask
+from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask, warn_of_border
 from lightdepth.datasets.video import VideoFile
 from lightdepth.datasets.video_calibration import VideoCalibration, found_calibration
 from lightdepth.errors import InputError
@@ -92,13 +92,16 @@ def read_video(
             path,
             "no camera.json beside it",
             'give --camera FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), '
-            "--camera auto to find it from the motion (--fov 70 where to start), or a map that has one",
+            "--camera auto to find it from the motion (--fov 70 where to start), or, where a verb takes --map, a "
+            "map that has one",
         )
     check_turned(video, camera)
     images = spread_pictures(video)
     check_depth(video, images)
     if mask is None:
         mask = border_mask(images)
+        if not mask.all():
+            warn_of_border(path, mask)
     check_clip(video, mask)
     names = [f"{i:06d}" for i in range(len(video))]
     load = _Load(video, camera, light or PhotometricCalibration(), mask)

@@ -119,7 +119,8 @@ def other_images(camera: CameraModel, of_frames: CameraModel | None) -> list[Rea
 def _of_other_size(much: str, scale: float) -> Reading:
     return Reading(
         f"the map's keypoints are those of images {much} as large as its camera says",
-        "correct width and height of the map's camera, with its focal length and principal point",
+        "correct width and height of the map's camera, with its focal length and principal point, or give the frames "
+        "that the map was made of",
         moved=lambda pixels: pixels / scale,
     )
 

@@ -87,4 +87,6 @@ def main(model: str, image_file: str, camera_file: str, out: str, mask_file: str
 
 
 if __name__ == "__main__":
+    if len(sys.argv) not in (5, 6):
+        sys.exit(__doc__)
     main(*sys.argv[1:])

@@ -179,6 +179,9 @@ def _why_not_folder(path: Path) -> InputError:
     for file in files:
         if file.suffix == ".osa" or (file.suffix in (".txt", ".tum") and _is_trajectory(file)):
             return _why_not_file(file)
+    inside = sorted(p for p in path.glob("*/sparse") if (p / "0").is_dir())
+    if inside:
+        return InputError(path, f"no map in it, but in {', '.join(p.parent.name for p in inside)}", f"give {inside[0]}")
     names = sorted(p.name for p in path.iterdir())
     found = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
     return InputError(path, f"no map in it (found {found or 'nothing: the folder is empty'})", _ACCEPTED)

@@ -11,7 +11,7 @@ Progress = Callable[[str, int, int], None]
 
 _MOTION = (
     "what helps: more frames; at least 5 mm of travel with some of it sideways (pure forward motion over 3 mm fails); "
-    "sharp frames (blurred ones have no features); a mask that leaves the tissue free"
+    "sharp frames of 250 rows or more (blurred and small ones lack features); a mask that leaves the tissue free"
 )
 ADVICE = (
     f"{_MOTION}; the calibration of this very image size. A lower --sfm.peak-threshold finds more features in smooth "
