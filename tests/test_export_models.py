@@ -327,6 +327,7 @@ def test_an_exr_whose_header_leads_back_or_names_no_type_is_refused(tmp_path, af
 
 def test_depth_that_does_not_fit_16_bits_is_refused(predictions, tmp_path, capsys):
     argv = ["export", str(predictions), "-o", str(tmp_path / "o"), "--to", "png", "--step"]
+    assert main([*argv, "1e9"]) == 3 and "less than 10 steps" in capsys.readouterr().err
     assert main([*argv, "1e-9"]) == 3
     said = capsys.readouterr().err
     assert "more than 65535 steps of 1e-09; give a larger one, such as 0.001" in said and str(tmp_path) not in said
