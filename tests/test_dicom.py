@@ -84,6 +84,12 @@ def test_times_are_the_header_s(folder, elements, times):
     assert [f.time for f in frames] == ([None] * COUNT if times is None else pytest.approx(times))
 
 
+def test_a_vector_of_steps_that_no_clip_has_is_left_aside(folder):
+    path = write_dicom(folder / "a.dcm", images(), FrameTimeVector=[0, 1e300, 1e300, 1e300])
+    with pytest.warns(UserWarning, match="FrameTimeVector does not fit 4 frames"):
+        assert open_sequence(path)[2].time == pytest.approx(0.08)
+
+
 def test_a_vector_of_times_of_another_length_is_left_aside_and_said(folder):
     path = write_dicom(folder / "a.dcm", images(), FrameTimeVector=[0, 40])
     with pytest.warns(UserWarning, match="FrameTimeVector does not fit 4 frames"):
@@ -162,6 +168,7 @@ def test_without_pydicom_one_line_names_the_extra(folder, monkeypatch, capsys):
     [
         ({"Rows": 65535, "Columns": 65535}, "DICOM pictures of 65535x65535"),
         ({"NumberOfFrames": 10**9}, "announces 1000000000 frames of 256x208, and 4 are in the file"),
+        ({"NumberOfFrames": 10**5}, "announces 100000 frames of 256x208, and 4 are in the file"),
         ({"Rows": 0}, "DICOM pictures of 256x0"),
         ({"Rows": 8000, "Columns": 8000}, "announces 4 frames of 8000x8000, and 0 are in the file"),
         ({"PhotometricInterpretation": "PALETTE COLOR", "SamplesPerPixel": 1}, "DICOM colours PALETTE COLOR"),

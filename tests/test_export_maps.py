@@ -294,3 +294,9 @@ def test_what_was_taken_off_a_far_map_stands_beside_what_is_made_of_it(place, tm
     kept = json.loads((tmp_path / "out" / "map_000" / "origin.json").read_text())
     assert kept == {"add_to_all_coordinates": [460000.0, 5400000.0, 160.0]}
     assert "far from its origin" in (tmp_path / "out" / "log.txt").read_text()
+
+
+@pytest.mark.parametrize("kind", ["ply", "exr"])
+def test_what_is_not_there_is_said_not_to_be(tmp_path, capsys, kind):
+    assert main(["export", str(tmp_path / "none"), "-o", str(tmp_path / "out"), "--to", kind]) == 3
+    assert "none: does not exist" in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -329,8 +329,19 @@ def test_an_exr_that_is_cut_off_or_none_is_refused(tmp_path):
         read_exr(tmp_path / "a.exr")
 
 
+@pytest.mark.parametrize(("after", "number"), [(b"compression\0compression\0", -28), (b"Z\0", -1), (b"Z\0", 9)])
+def test_an_exr_whose_header_leads_back_or_names_no_type_is_refused(tmp_path, after, number):
+    write_exr(tmp_path / "a.exr", np.ones((8, 9), np.float32))
+    whole = (tmp_path / "a.exr").read_bytes()
+    at = whole.index(after) + len(after)
+    (tmp_path / "a.exr").write_bytes(whole[:at] + number.to_bytes(4, "little", signed=True) + whole[at + 4 :])
+    with refused(found="a broken EXR file"):
+        read_exr(tmp_path / "a.exr")
+
+
 def test_depth_that_does_not_fit_16_bits_is_refused(predictions, tmp_path, capsys):
     argv = ["export", str(predictions), "-o", str(tmp_path / "o"), "--to", "png", "--step"]
+    assert main([*argv, "1e9"]) == 3 and "less than 10 steps" in capsys.readouterr().err
     assert main([*argv, "1e-9"]) == 3
     said = capsys.readouterr().err
     assert "more than 65535 steps of 1e-09; give a larger one, such as 0.001" in said and str(tmp_path) not in said

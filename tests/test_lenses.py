@@ -256,3 +256,38 @@ def test_a_lens_drawn_at_random_is_read_in_every_format_that_holds_it(tmp_path, 
         assert off(camera, expected, rays) < 1e-9, f"{name}: {lens}"
         if isinstance(camera, FullBrown):
             assert any(lens.terms[4:])
+
+
+@pytest.mark.parametrize(
+    ("lens", "found"),
+    [
+        ({"camera_model": "ds", "intrinsics": [5, 7, 300, 300, 320, 240]}, "alpha 7"),
+        ({"camera_model": "eucm", "intrinsics": [60, 1.1, 300, 300, 320, 240]}, "alpha 60"),
+        (
+            {
+                "camera_model": "pinhole",
+                "intrinsics": [300, 300, 320, 240],
+                "distortion_model": "fov",
+                "distortion_coeffs": [50],
+            },
+            "omega 50",
+        ),
+    ],
+)
+def test_numbers_that_no_such_lens_has_are_refused_before_a_lens_is_fitted_to_them(tmp_path, lens, found):
+    file = written(tmp_path / "camchain.yaml", {"cam0": {**lens, "resolution": [640, 480]}})
+    with refused(found=found):
+        read_camera(file)
+
+
+def test_xml_that_is_nested_without_end_is_refused(tmp_path, capsys):
+    text = "<opencv_storage>" + "<a>" * 5000 + "</a>" * 5000 + "</opencv_storage>"
+    assert main(["convert-camera", str(written(tmp_path / "a.xml", text)), "-o", str(tmp_path / "c.json")]) == 3
+    assert "inside one another" in capsys.readouterr().err
+
+
+def test_a_refused_coefficient_names_its_file_once(tmp_path, capsys):
+    numbers = {"camera_matrix": K, "distortion_coefficients": [1.0] * 7, **SIZE}
+    file = written(tmp_path / "a.yaml", numbers)
+    assert main(["convert-camera", str(file), "-o", str(tmp_path / "c.json")]) == 3
+    assert capsys.readouterr().err.count(str(file)) == 1

@@ -18,6 +18,7 @@ from typing import get_args, get_origin
 import pytest
 
 from lightdepth.cli import GROUP, main, verb_parser
+from lightdepth.command_line.gone_settings import without_gone
 from lightdepth.command_line.pages import PAGES
 from lightdepth.command_line.parsing import Parser, options, parsed
 from lightdepth.datasets import FORMATS, FormatName
@@ -239,6 +240,21 @@ MISTAKES = {
 def test_a_mistake_is_told_what_was_typed_and_what_would_be_right(case, capsys):
     verb, argv, words = MISTAKES[case]
     assert words in told(verb, argv, capsys)
+
+
+def test_a_file_of_settings_may_spell_them_with_dashes_as_help_does(tmp_path):
+    (tmp_path / "c.yaml").write_text("mm-per-unit: 3\nfit-light: false\nalignment: {min-points: 21}\n")
+    found = parsed(parsers()["densify"], ["D", "-o", "O", "--config", str(tmp_path / "c.yaml")])
+    assert (found["mm_per_unit"], found["fit_light"], found["alignment.min_points"]) == (3, False, 21)
+
+
+def test_an_option_that_is_gone_is_said_to_be_on_the_command_line_and_left_out_of_a_file(tmp_path, capsys):
+    words = ["-o", "O", "--trainer.limit-test-batches", "2"]
+    assert "--trainer.limit-test-batches is no more (it had no effect): leave it out" in told("train", words, capsys)
+    (tmp_path / "c.yaml").write_text("trainer.limit-test-batches: 2\ntrainer: {barebones: true, max-steps: 7}\n")
+    with pytest.warns(UserWarning, match="limit_test_batches .*barebones"):
+        (text,) = without_gone("train", [f"--config={tmp_path / 'c.yaml'}"])
+    assert text == "--config=trainer:\n  max_steps: 7\n"
 
 
 FILES = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -180,3 +181,28 @@ def test_metrics_of_another_program_s_folder_are_never_written_into_it(data, tmp
     assert "add -o FOLDER" in capsys.readouterr().err
     assert main(["evaluate", str(folder), "--depth-kind", "distance", "-o", str(tmp_path / "out")]) == 3
     assert "give --truth DATA" in capsys.readouterr().err
+
+
+def test_depth_files_that_would_hang_or_take_all_memory_are_refused_at_once(data, tmp_path, capsys):
+    def refusal(folder: Path) -> str:
+        argv = ["evaluate", str(folder), "--truth", str(data), "-o", str(tmp_path / "out"), "--depth-kind", "depth"]
+        assert main(argv) == 3 and not (tmp_path / "out").exists()
+        return capsys.readouterr().err
+
+    pipes, huge = tmp_path / "pipes", tmp_path / "huge"
+    for folder in (pipes, huge):
+        folder.mkdir()
+    os.mkfifo(pipes / "0.exr")
+    assert "a named pipe or a device" in refusal(pipes)
+    with (huge / "0.npy").open("wb") as stream:
+        shape = {"descr": "<f4", "fortran_order": False, "shape": (10**7, 10**7)}
+        np.lib.format.write_array_header_1_0(stream, shape)
+    assert "not an array" in refusal(huge)
+
+
+def test_a_scale_beyond_what_32_bits_hold_is_refused_without_a_warning_of_numpy(data, distances, tmp_path, capsys):
+    folder = written(tmp_path / "theirs", f"{FRAMES[0].name}.npy", distances[0])
+    argv = ["--truth", str(data), "-o", str(tmp_path / "out"), "--depth-kind", "distance", "--depth-scale", "1e300"]
+    assert main(["evaluate", str(folder), *argv]) == 3
+    said = capsys.readouterr().err
+    assert "no depth that 32 bits hold, with a scale of 1e+300" in said and "RuntimeWarning" not in said

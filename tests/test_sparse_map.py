@@ -10,6 +10,7 @@ from raising import refused
 from scenes import C3VD, ENDOMAPPER
 from scipy.spatial.transform import Rotation
 
+from lightdepth.datasets.counting import BY_NUMBER, Counting
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap, check_rigid, covisibility, typical_distance
 
 
@@ -170,3 +171,9 @@ def test_a_sequence_without_maps_or_with_one_id_twice_is_refused_with_its_source
     with refused(where="run/output", found="two maps have the id 3"):
         SparseMap((submap(id=3), submap(id=1), submap(id=3)), "run/output")
     assert len(SparseMap((submap(id=3), submap(id=1)), "run/output").submaps) == 2
+
+
+@pytest.mark.parametrize("number", [1403636579829666666, 1403636579763000001])
+def test_a_keyframe_named_in_nanoseconds_meets_the_frame_of_that_very_name(number):
+    keyframe = Keyframe(f"{number}.png", ENDOMAPPER, np.eye(4), np.zeros((0, 2)), np.zeros(0, int))
+    assert BY_NUMBER.number(keyframe) == number and Counting(offset=-1).number(keyframe) == number - 1

@@ -214,3 +214,9 @@ def test_a_video_too_short_for_stretches_and_one_with_another_mask_are_looked_at
     video = VideoFile(filmed(tmp_path, [picture(0)]))
     check_clip(video, OCTAGON)
     check_clip(video, np.ones((5, 5), bool))
+
+
+@pytest.mark.parametrize("depth", ["0", "99"])
+def test_a_bit_depth_that_no_sample_has_is_refused_for_a_video_as_for_pictures(tmp_path, capsys, depth):
+    path = filmed(tmp_path / "a", [picture(i) for i in range(2)])
+    assert f"--bit-depth: {depth}" in refusal(capsys, "import", path, "-o", tmp_path / "out", "--bit-depth", depth)

@@ -48,6 +48,8 @@ def export(
     path = Path(what)
     if to is None:
         raise InputError("--to", "not given", f"expected one of {', '.join(get_args(Kind))}")
+    if to not in get_args(MODEL_KINDS) and not path.exists():  # a checkpoint may be a name
+        raise InputError(path, "does not exist", "expected a run of densify, a map folder, or a folder of predict")
     if to in get_args(MAP_KINDS) and not map_folders(path):
         raise InputError(path, "no dense map in it", f"expected a run of `lightdepth densify` for --to {to}")
     if to in get_args(DEPTH_KINDS) and not (path.is_dir() and any(path.glob("*.npz"))):

@@ -27,6 +27,7 @@ from lightdepth.camera import CameraModel
 from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
 from lightdepth.files.exr import read_exr
+from lightdepth.files.headers import what_is_there
 from lightdepth.files.images import read_raw
 from lightdepth.geometry import distance_from_depth
 from lightdepth.prediction import DepthPrediction, read_prediction
@@ -36,7 +37,7 @@ SUFFIXES = ("npz", "npy", "exr", "tiff", "tif", "png")
 """Endings that are read, the first that a folder has: a picture often lies beside the numbers."""
 _NAMES = ("distance", "depth", "disparity", "disp", "pred", "prediction", "arr_0")
 _CHANNELS = ("Z", *_NAMES[:4], "V", "Y", "R")
-_UNREADABLE = (OSError, EOFError, ValueError, TypeError, zipfile.BadZipFile, zlib.error)
+_UNREADABLE = (OSError, EOFError, ValueError, TypeError, MemoryError, zipfile.BadZipFile, zlib.error)
 _LEAST_RAY_Z = 0.05  # as of true depth: farther to the side, depth along the axis says nothing
 
 
@@ -98,13 +99,22 @@ class DepthReading:
             except InputError as error:
                 cure = f"{error.cure}; of another program's depth say --depth-kind distance, depth or disparity"
                 raise InputError(error.where, error.found, cure) from error
+        if not path.is_file():  # a named pipe would wait for ever
+            raise InputError(path, what_is_there(path), "expected a file of depth")
         values, valid = _array(path, self.depth_kind)
         valid &= np.isfinite(values) & (values > 0)
         if not valid.any():
             raise InputError(path, "no finite number above 0 in it", "leave it out, or is it of another kind?")
         values = np.where(valid, values, 1)
         scale = self.depth_scale or 1.0
-        metric = (scale / values if self.depth_kind == "disparity" else scale * values).astype(np.float32)
+        with np.errstate(over="ignore"):
+            metric = (scale / values if self.depth_kind == "disparity" else scale * values).astype(np.float32)
+        valid &= np.isfinite(metric) & (metric > 0)
+        if not valid.any():
+            raise InputError(
+                path, f"no depth that 32 bits hold, with a scale of {scale:g}", "is --depth-scale of another unit?"
+            )
+        metric = np.where(valid, metric, np.float32(1))
         metric, valid = _resized(metric, valid, camera, path)
         if self.depth_kind != "distance":
             ray_z = camera.rays()[0][..., 2]

@@ -91,7 +91,8 @@ def matrix_and_distortion(content: Fields, path: Path, size: tuple[int, int] | N
             raise InputError(where, f"{len(terms)} numbers", "the model fisheye has 4: k1 k2 k3 k4")
         camera = camera_from_params(KannalaBrandt.name, width, height, [*focal, *terms], str(path))
     else:
-        camera = camera_of(lambda: opencv_camera(width, height, [*focal, *_opencv_terms(terms, where)]), str(path))
+        opencv = [*focal, *_opencv_terms(terms, where)]
+        camera = camera_of(lambda: opencv_camera(width, height, opencv), str(path))
         if len(terms) == 4 and any(terms) and not any(letters(fields.get(key)) in _BROWN[:-1] for key in _MODELS):
             warnings.warn(
                 f"{where}: 4 numbers and no distortion_model: read as k1 k2 p1 p2. If cv2.fisheye made them, add the "

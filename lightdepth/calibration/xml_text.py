@@ -30,7 +30,12 @@ def xml_root(path: Path) -> Element:
 def opencv_fields(path: Path) -> dict[str, Any] | None:
     """Everything in an `<opencv_storage>` by its tag in small letters; None where the file is another program's."""
     root = xml_root(path)
-    return {child.tag.lower(): _value(child) for child in root} if root.tag == "opencv_storage" else None
+    if root.tag != "opencv_storage":
+        return None
+    try:
+        return {child.tag.lower(): _value(child) for child in root}
+    except RecursionError as error:
+        raise InputError(path, "elements inside one another without end", "expected OpenCV's XML") from error
 
 
 def _value(element: Element) -> Any:

@@ -224,6 +224,8 @@ def division_bend(k: float) -> Bend:
 
 def fov_bend(omega: float) -> Bend:
     """Devernay's field of view: distorted radius = atan(2 r tan(omega / 2)) / omega."""
+    if not abs(omega) < np.pi:
+        raise InputError("FOV lens", f"omega {omega:g}", "expected radians, below pi")
 
     def bend(rays: np.ndarray) -> np.ndarray:
         side = np.hypot(rays[:, 0], rays[:, 1])
@@ -237,8 +239,14 @@ def fov_bend(omega: float) -> Bend:
     return bend
 
 
+def _check_alpha(where: str, alpha: float) -> None:
+    if not 0 <= alpha <= 1:
+        raise InputError(where, f"alpha {alpha:g}", "expected 0 to 1: are the numbers in another order?")
+
+
 def eucm_bend(alpha: float, beta: float) -> Bend:
     """Khomutenko's extended unified model."""
+    _check_alpha("EUCM lens", alpha)
 
     def bend(rays: np.ndarray) -> np.ndarray:
         x, y, z = rays.T
@@ -250,6 +258,7 @@ def eucm_bend(alpha: float, beta: float) -> Bend:
 
 def double_sphere_bend(xi: float, alpha: float) -> Bend:
     """Usenko's double sphere, of unit rays."""
+    _check_alpha("double sphere lens", alpha)
 
     def bend(rays: np.ndarray) -> np.ndarray:
         x, y, z = rays.T

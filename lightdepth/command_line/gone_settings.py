@@ -57,6 +57,10 @@ def _kept(file: str, gone: Mapping[str, str]) -> str:
 
 def _dropped(settings: Any, keys: Sequence[str]) -> bool:
     """Takes a key out of nested settings; False where it is not there."""
+    whole = ".".join(keys)
+    if isinstance(settings, dict) and whole in settings:
+        del settings[whole]
+        return True
     for key in keys[:-1]:
         settings = settings.get(key) if isinstance(settings, dict) else None
     if not isinstance(settings, dict) or keys[-1] not in settings:

@@ -26,6 +26,7 @@ from jsonargparse import (
     set_parsing_settings,
 )
 
+from lightdepth.command_line.gone_settings import GONE_SETTINGS
 from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, literals, placeholder
 from lightdepth.command_line.pages import Page
 from lightdepth.command_line.settings_yaml import read_settings, use_words
@@ -288,6 +289,9 @@ def _unknown(parser: Parser, word: str) -> tuple[str, str]:
     if not word.startswith("-"):
         return f"{word}: nothing takes this word; options begin with --", ""
     name = word.partition("=")[0]
+    gone = GONE_SETTINGS.get(parser.prog.rpartition(" ")[2], {}).get(name.lstrip("-").replace("-", "_"))
+    if gone is not None:
+        return f"{dashed(name)} is no more ({gone}): leave it out", ""
     nearest = closest(name.lstrip("-").replace("-", "_"), _names(parser))
     return f"no option {dashed(name)}" + (f"; did you mean --{dashed(nearest)}?" if nearest else ""), nearest
 

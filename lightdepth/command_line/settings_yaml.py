@@ -1,7 +1,9 @@
-"""YAML of settings: `judge: {on: false}`, where YAML 1.1 takes a bare `on` for the value true."""
+"""YAML of settings: `judge: {on: false}`, where YAML 1.1 takes a bare `on` for the value true; and keys as `--help`
+spells options, with dashes."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import yaml
 from jsonargparse import get_loader, set_loader
 
 _WORDS = {True: "on", False: "off"}
+_DASHED = re.compile(r"[a-z][a-z0-9_.]*(-[a-z0-9_.]+)+")
 _library = get_loader("yaml")
 
 
@@ -31,7 +34,14 @@ def _loaded(text: str) -> Any:
 
 
 def with_words(value: Any) -> Any:
-    """The same with keys that are words again where YAML took them for true and false."""
+    """The same with keys that are words again where YAML took them for true and false, and settings' own names where
+    they have dashes."""
     if isinstance(value, Mapping):
-        return {(_WORDS[k] if isinstance(k, bool) else k): with_words(v) for k, v in value.items()}
+        return {_word(k): with_words(v) for k, v in value.items()}
     return [with_words(v) for v in value] if isinstance(value, list) else value
+
+
+def _word(key: Any) -> Any:
+    if isinstance(key, bool):
+        return _WORDS[key]
+    return key.replace("-", "_") if isinstance(key, str) and _DASHED.fullmatch(key) else key

@@ -49,6 +49,8 @@ def predict(
     arguments = recorded(
         source, output=output, checkpoint=checkpoint, refine=refine, uncertainty=uncertainty, previews=previews
     )
+    if refine < 0:
+        raise InputError("--refine", f"{refine}", "expected a number of steps, 0 for none")
     if refine and uncertainty is not None:
         raise InputError("--uncertainty", "refined distance has no uncertainty", "leave out one of it and --refine")
     model = load_model(checkpoint)

@@ -47,6 +47,8 @@ class Clip(Protocol):
 
 def white_level(bits: int, bit_depth: int | None) -> float:
     """The share of a file's own white that is white, where its samples have `bits` and the user says `bit_depth`."""
+    if bit_depth is not None and not 1 <= bit_depth <= 32:
+        raise InputError("--bit-depth", f"{bit_depth}", "expected the bits of a sample, from 8 to 32")
     if bit_depth is None or bits <= 8:
         return 1.0
     if not 1 <= bit_depth <= bits:

@@ -19,7 +19,8 @@ class Counting:
 
     def number(self, keyframe: Keyframe) -> int:
         """The number of the frame that a keyframe is."""
-        return round(self.rate * keyframe.number) + self.offset
+        counted = keyframe.number if self.rate == 1 else round(self.rate * keyframe.number)  # nanoseconds fit no float
+        return counted + self.offset
 
 
 BY_NUMBER = Counting()

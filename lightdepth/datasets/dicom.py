@@ -48,6 +48,8 @@ _COMPRESSED = "1.2.840.10008.1.2.4."
 _VIDEOS = tuple(f"{_COMPRESSED}{n}" for n in range(100, 109))  # MPEG-2, H.264, HEVC, and their fragmented kin
 _RLE = "1.2.840.10008.1.2.5"
 _MOST_PIXELS, _MOST_FRAMES = 2**26, 10**6
+_MOST_MISSING = 1000  # announced frames for each one that is there, from which the number is wrong and no file cut off
+_LONGEST_MS = 1e5  # from a frame to the next
 _CONVERT = "convert it without compression (dcmdjpeg of DCMTK, or gdcmconv --raw), or export a video"
 
 
@@ -170,7 +172,8 @@ def _checked(
                 path, f"DICOM samples of {stored} bits in {allocated}", "expected unsigned samples of 8 or 16 bits"
             )
     frames = _frames(path, said, start, length, size, announced, syntax, width * height * samples * allocated // 8)
-    if not frames or (len(frames) < announced and not video and announced > _MOST_FRAMES):
+    lacking = not video and announced > min(_MOST_MISSING * len(frames), max(_MOST_FRAMES, len(frames)))
+    if not frames or lacking:
         raise InputError(
             path,
             f"the header announces {announced} frames of {width}x{height}, and {len(frames)} are in the file",
@@ -268,7 +271,7 @@ def _eight_or_sixteen(pixels: np.ndarray, header: DicomHeader, where: str) -> np
 def _times(said: dict[str, Any], count: int, path: Path) -> np.ndarray | None:
     """Times (n,) [s] of the frames: by the vector of their steps, by one step, or by a rate (PS3.3, C.7.6.5)."""
     steps = _numbers(said["FrameTimeVector"])
-    if len(steps) == count and count > 1 and (steps[1:] > 0).all():
+    if len(steps) == count and count > 1 and ((steps[1:] > 0) & (steps[1:] < _LONGEST_MS)).all():
         return np.asarray(np.cumsum(np.concatenate([[0.0], steps[1:]])) / 1000)
     if len(steps):
         warnings.warn(
@@ -276,7 +279,7 @@ def _times(said: dict[str, Any], count: int, path: Path) -> np.ndarray | None:
         )
     for element in ("FrameTime", "CineRate", "RecommendedDisplayFrameRate"):
         value = _numbers(said[element])
-        if len(value) == 1 and 0 < value[0] < 1e5:
+        if len(value) == 1 and 0 < value[0] < _LONGEST_MS:
             step = float(value[0]) / 1000 if element == "FrameTime" else 1 / float(value[0])
             return np.asarray(step * np.arange(count))
     return None

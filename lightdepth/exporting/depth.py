@@ -16,6 +16,7 @@ from lightdepth.geometry import depth_from_distance
 from lightdepth.prediction import DepthPrediction
 
 CODES = 65535
+_LEAST_CODES = 10  # of a folder's farthest depth: with fewer, a picture holds no depth
 
 
 def depth_of(prediction: DepthPrediction) -> np.ndarray:
@@ -42,6 +43,12 @@ def checked_step(step: float, largest: float, unit: str) -> float:
             "--step",
             f"the farthest depth, {largest:.4g}, is more than {CODES} steps of {step:g}",
             f"give a larger one, such as {fitting_step(largest, unit):g}, or leave it out",
+        )
+    if 0 < largest < _LEAST_CODES * step:
+        raise InputError(
+            "--step",
+            f"the farthest depth, {largest:.4g}, is less than {_LEAST_CODES} steps of {step:g}",
+            f"give a smaller one, such as {fitting_step(largest, unit):g}, or leave it out",
         )
     return step
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from lightdepth.errors import InputError
+from lightdepth.files.headers import what_is_there
 
 _MAGIC = struct.pack("<i", 20000630)
 _LINES = {0: 1, 2: 1, 3: 16}  # in a block, by compression: none, ZIPS, ZIP
@@ -52,6 +53,8 @@ def write_exr(path: Path, values: np.ndarray, channel: str = "Z") -> None:
 
 def read_exr(path: Path) -> dict[str, np.ndarray]:
     """The channels (H, W) by name. Raises InputError for what is none, is broken, or is stored in another way."""
+    if not path.is_file():  # a named pipe would wait for ever
+        raise InputError(path, what_is_there(path), "expected an EXR file")
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -63,8 +66,10 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
         return _channels(data, head)
     except InputError:
         raise
-    except (struct.error, ValueError, IndexError, KeyError, UnicodeDecodeError, zlib.error) as error:
-        raise InputError(path, f"a broken EXR file ({error or 'cut off'})", "copy it again, or leave it out") from error
+    except (struct.error, IndexError, KeyError, UnicodeDecodeError, zlib.error, MemoryError) as error:
+        raise InputError(path, "a broken EXR file (cut off, or changed)", "copy it again, or leave it out") from error
+    except ValueError as error:
+        raise InputError(path, f"a broken EXR file ({error})", "copy it again, or leave it out") from error
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,7 @@ def _header(data: bytes, path: Path) -> _Head:
     while data[place]:
         name, place = _word(data, place)
         _, place = _word(data, place)
-        (size,) = struct.unpack_from("<i", data, place)
+        (size,) = struct.unpack_from("<I", data, place)  # one below zero would lead back, without end
         found[name] = data[place + 4 : place + 4 + size]
         place += 4 + size
     compression = found["compression"][0]
@@ -101,6 +106,8 @@ def _header(data: bytes, path: Path) -> _Head:
         kind, _, across, down = struct.unpack_from("<iB3x2i", listed, at)
         if (across, down) != (1, 1):
             raise InputError(path, f"an EXR file whose channel {name} has fewer pixels than the image", _CURE)
+        if not 0 <= kind < len(_TYPES):
+            raise ValueError(f"numbers of the unknown type {kind}")
         names.append((name, _TYPES[kind]))
         at += 16
     width, height = right - left + 1, bottom - top + 1
