@@ -51,7 +51,7 @@ class DepthReading:
     predict`."""
     depth_scale: float | None = None
     """Factor from the numbers in another program's depth files to mm (of disparity: depth is the factor over it). Left
-    out, they are up to scale. A larger one makes a farther wall."""
+    out, they are up to scale, or as `lightdepth export` says in its run.json. A larger one makes a farther wall."""
 
     def __post_init__(self) -> None:
         if self.depth_scale is not None and not (np.isfinite(self.depth_scale) and self.depth_scale > 0):
@@ -106,7 +106,8 @@ class DepthReading:
         if not valid.any():
             raise InputError(path, "no finite number above 0 in it", "leave it out, or is it of another kind?")
         values = np.where(valid, values, 1)
-        scale = self.depth_scale or 1.0
+        step, own_unit = _own_step(path.parent)
+        scale = step if self.depth_scale is None else self.depth_scale
         with np.errstate(over="ignore"):
             metric = (scale / values if self.depth_kind == "disparity" else scale * values).astype(np.float32)
         valid &= np.isfinite(metric) & (metric > 0)
@@ -120,8 +121,18 @@ class DepthReading:
             ray_z = camera.rays()[0][..., 2]
             valid &= ray_z > _LEAST_RAY_Z
             metric = distance_from_depth(metric, np.where(valid, ray_z, 1)).astype(np.float32)
-        unit = "up to scale" if self.depth_scale is None else "mm"
+        unit = own_unit if self.depth_scale is None else "mm"
         return DepthPrediction(path.stem, metric, valid, camera, f"{self.depth_kind} in {path.suffix} files", unit)
+
+
+def _own_step(folder: Path) -> tuple[float, str]:
+    """What one number stands for in a folder that `lightdepth export` made, and its unit; 1, up to scale, elsewhere."""
+    record = run_record(folder)
+    if not isinstance(record, Mapping) or record.get("verb") != "export":
+        return 1.0, "up to scale"
+    step = record.get("step")
+    unit = "mm" if record.get("unit") == "mm" else "up to scale"
+    return (float(step) if isinstance(step, (int, float)) and np.isfinite(step) and step > 0 else 1.0), unit
 
 
 def other_depth(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from densify.exporting.exported import Exportable
 from lightdepth.files.tum import write_tum
 from lightdepth.frame import frame_number
 from lightdepth.maps import write_multimap
+from lightdepth.maps.convention import SIDECAR
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 RUNTIME = "runtime.txt"
@@ -38,7 +40,7 @@ def write_climb(
 
     CLiMB counts frames from 1: `offset` is added to our numbers. All frames that the SLAM localised are in it, where
     its tree has them, else the keyframes. points3D.txt has the map's points and, of the surface, at most so many
-    `points`. `seconds` are those of the start and of the work.
+    `points`. `seconds` are those of the start and of the work. A sidecar tells our own reader the offset.
     """
 
     def counted(keyframe: Keyframe) -> Keyframe:
@@ -58,3 +60,5 @@ def write_climb(
     write_multimap(SparseMap(tuple(submaps), "dense maps"), folder, trajectories, named)
     text = f"init_seconds={seconds[0]:.3f}\nprocessing_seconds={seconds[1]:.3f}\n"
     (folder / RUNTIME).write_text(text, encoding="utf-8")
+    if offset:
+        (folder / SIDECAR).write_text(json.dumps({"frame_offset": -offset}) + "\n", encoding="utf-8")
