@@ -47,10 +47,11 @@ def as_the_images_say(look: Look, other: Look, guess: np.ndarray, config: Parall
 
     `guess` (h, w) is the distance about each pixel of the first, map units. The other comes back as it is where its
     pose agrees (median distance from the epipolar lines at most `config.off_line` pixels), where too little can be
-    tracked, or where no turn and direction near the map's brings that distance to 60 % of what it was.
+    tracked, where its image is of another size, or where no turn and direction near the map's brings that distance to
+    60 % of what it was.
     """
     start = other.keyframe.cam_from_map @ np.linalg.inv(look.keyframe.cam_from_map)
-    if np.linalg.norm(start[:3, 3]) < 1e-12:
+    if np.linalg.norm(start[:3, 3]) < 1e-12 or look.usable.shape != other.usable.shape:
         return other
     tracks = tracked(look, other, guess, start, config)
     pixels = pixels_per_radian(other.keyframe.camera)

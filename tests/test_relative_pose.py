@@ -82,6 +82,23 @@ def test_white_frames_and_keyframes_on_one_spot_change_nothing(frames, submap):
     assert as_the_images_say(look, look, guess, CONFIG) is look
 
 
+def test_tracks_that_no_pose_explains_overrule_nothing(frames, submap, monkeypatch):
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(2, 300, 3)) + (0, 0, 3)
+    noise = Tracks(*(rays / np.linalg.norm(rays, axis=2)[..., None]))
+    monkeypatch.setattr("lightdepth.relative_pose.tracked", lambda *_: noise)
+    look, other = (look_at(frames, submap.keyframes[i]) for i in (0, 2))
+    assert as_the_images_say(look, other, guessed(look.keyframe, submap), CONFIG) is other
+
+
+def test_an_image_of_another_size_is_not_tracked_into(frames, submap):
+    look = look_at(frames, submap.keyframes[0])
+    smaller = Look.of(submap.keyframes[2], frames[submap.keyframes[2].number], 80)
+    assert smaller.usable.shape != look.usable.shape
+    wrong = turned(smaller, 2.0)
+    assert as_the_images_say(look, wrong, guessed(look.keyframe, submap), CONFIG) is wrong
+
+
 def test_the_fit_finds_turn_and_direction_with_a_tenth_of_the_tracks_wrong():
     rng = np.random.default_rng(3)
     there_from_here = np.eye(4)
