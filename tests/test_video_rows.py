@@ -84,7 +84,10 @@ def test_a_map_s_times_meet_frames_of_a_varying_rate_by_stamp_though_a_rate_is_g
 
 @pytest.mark.parametrize(("name", "codec"), [("a.mkv", "ffv1"), ("a.mp4", "libx264"), ("b.mkv", "libx265")])
 def test_ten_bits_have_the_depth_and_the_valid_share_of_eight(tmp_path, name, codec):
-    lossless = {"libx264": {"qp": "0"}, "libx265": {"x265-params": "lossless=1:log-level=none"}}.get(codec, {})
+    lossless = {
+        "libx264": {"qp": "0"},
+        "libx265": {"x265-params": "lossless=1:log-level=none:bframes=0:frame-threads=1:pools=none"},
+    }.get(codec, {})
     images = [picture(i) for i in range(2)]
     eight = filmed(tmp_path / "8", images, name, codec, "yuv420p", **lossless)
     ten = filmed(tmp_path / "10", images, name, codec, "yuv420p10le", **lossless)
