@@ -59,8 +59,9 @@ class TruthSource:
     """Bits of a sample in the truth's pictures that are stored in more than 8; left out, what the files say, else what
     their highest values show. A larger one reads the same numbers as darker."""
     truth_mesh: Path | None = None
-    """Mesh file of the true surface, in mm and in the frame of the true poses; left out, C3VD's own where it lies
-    beside the frames, else one made of true depth."""
+    """Mesh file (PLY, OBJ, STL or GLB) of the true surface, in mm and in the frame of the true poses, for the figure
+    "to true mesh" of surfaces alone: precision and recall stay by true depth, without which it is not used. Left out,
+    C3VD's own where it lies beside the frames, else one made of true depth."""
 
     def sequence(self, folder: Path) -> SequenceSource:
         """A folder of the truth: itself, or one of its sequences."""

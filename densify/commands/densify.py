@@ -42,7 +42,8 @@ def densify(
         formats: Formats of the mesh files to write: ply, which must be among them, and besides it glb and obj if
             wanted.
         mm_per_unit: Millimetres per map unit, where known: lengths and surfaces are then written in mm, else in map
-            units. A larger one makes a larger surface.
+            units. It is one factor for all submaps, right for those that share a unit. A larger one makes a larger
+            surface.
         fit_light: Where neither --light nor the folder gives the light, fit it on the map, and use it if depth by it
             fits hidden blocks of wall better; switched off, a usual light is assumed.
         merge: Join submaps that see the same tissue, and write one surface for each group besides the single ones;

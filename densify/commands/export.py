@@ -35,8 +35,8 @@ def export(
         what: Densify run or map folder (colmap, nerfstudio, ply, glb, obj, tum, climb), folder of predict (png, exr),
             or checkpoint (onnx, torch, safetensors).
         output: Folder to make, with a folder for each map, a file for each frame, or the model.
-        to: What to write: colmap, nerfstudio, ply, glb, obj, tum or climb of maps; png (16 bits) or exr of depth;
-            onnx, torch (torch.export) or safetensors of a network.
+        to: What to write, which has to be said: colmap, nerfstudio, ply, glb, obj, tum or climb of maps; png (16 bits)
+            or exr of depth; onnx, torch (torch.export) or safetensors of a network.
         size: Width and height, pixels, of the only images that an onnx or torch graph shall take; left out, it takes
             any. A larger one makes the network slower.
         half: Store the weights of safetensors in half precision, as checkpoints are kept; no-half keeps all digits.

@@ -42,7 +42,8 @@ def live(
             only the report uses it. A larger one counts more keyframes as in time.
         sfm: how frames are mapped when there is no map
         mm_per_unit: Millimetres per map unit, where known: lengths and surfaces are then written in mm, else in map
-            units. A larger one makes a larger surface.
+            units. It is one factor for all submaps, right for those that share a unit. A larger one makes a larger
+            surface.
         fit_light: Where neither --light nor the folder gives the light, fit it on the map before the clock starts, and
             use it if depth by it fits hidden blocks of wall better; switched off, a usual light is assumed.
         overwrite: Replace a run made before.

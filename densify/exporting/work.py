@@ -33,7 +33,8 @@ class MapExport:
     """Number of the surface's vertices at most that stand among the points of colmap, nerfstudio and climb, besides
     the map's own. More show the surface more finely and make larger files."""
     frame_offset: int = 1
-    """Number added to each frame's for climb, which counts frames from 1. More shift the frames later."""
+    """Number added to each frame's number where climb is written, which counts frames from 1 and we from 0. A larger
+    one gives later numbers."""
 
 
 def export_maps(run: Run, source: Path, to: str, options: MapExport) -> None:

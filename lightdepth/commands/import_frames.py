@@ -43,7 +43,7 @@ def import_frames(
     """A video or a folder of frames as a sequence, without the patient's name, and a report on what is wrong with it.
 
     Args:
-        output: Folder to make, with the sequence and the report.
+        output: Folder to make, with the sequence and the report; with --no-frames, the report and its tables alone.
         overlay_mask: Image of the frames' size, white where text is to be blacked out, besides what --find-text finds.
         find_text: Look for text burnt into the frames, and black it out; switched off, only what --overlay-mask marks
             is.

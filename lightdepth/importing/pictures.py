@@ -34,8 +34,8 @@ class PictureConfig:
     """How pictures are cut, resized and freed of interlacing."""
 
     size: tuple[int, int] | None = None
-    """Width and height to resize the frames to, pixels, the camera with them; left out, they keep theirs. A larger one
-    keeps finer detail."""
+    """Width and height to resize the frames to, pixels, after --crop, the camera with them; left out, they keep theirs.
+    A larger one keeps finer detail, up to the frames' own size; other proportions than theirs stretch the picture."""
     crop: Literal["none", "auto"] = "none"
     """Whether the black border around the tissue is cut off: none keeps it; auto cuts it off and shifts the camera's
     centre to match."""

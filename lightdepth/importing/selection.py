@@ -22,8 +22,8 @@ class Choice:
     """Number of frames to keep per second, the sharpest of each interval; left out, 5 for a video, and all of a folder.
     More keep more frames; not with --every."""
     every: int | None = None
-    """Number N of which every N-th of the sharp frames is kept, instead of a rate per second. More keep fewer
-    frames."""
+    """Number N of which every N-th frame is kept, counted over all frames from --start on, unless it is blurred or
+    frozen; instead of a rate per second. More keep fewer frames."""
     start: float = 0.0
     """Time before which frames are left out, seconds from the first frame. A larger one leaves out more at the
     beginning."""
@@ -31,8 +31,8 @@ class Choice:
     """Time after which frames are left out, seconds from the first frame; left out itself, all are kept to the last. A
     larger one keeps more."""
     blur: float = 0.6
-    """Share, in [0, 1), of the sharpness of the sharper frames within about a second before and after, below which a
-    frame is left out as blurred; 0 keeps all. A larger one leaves out more."""
+    """Share, in [0, 1), of the sharpness that the best quarter of the frames within about a second before and after
+    reach, below which a frame is left out as blurred; 0 leaves out none as blurred. A larger one leaves out more."""
     max_frames: int | None = None
     """Largest number of frames to keep; where the other options keep more, this number of those is taken, evenly. A
     larger one keeps more frames; without it there is no limit."""

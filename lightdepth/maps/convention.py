@@ -105,14 +105,16 @@ class MapReading:
     map_folder: str | None = None
     """Folder of images in the map whose keyframes are taken, where it holds several (left, right; two clips)."""
     map_sensor: int | None = None
-    """Number of the map's camera whose keyframes are taken, where it holds several, such as a stereo rig's left one.
-    Another one takes the keyframes of another camera."""
+    """Id of the camera, as in a COLMAP map's own files, whose keyframes are taken where it holds several, such as a
+    stereo rig's left one; other maps have none. Another one takes another camera's keyframes; left out, all are taken,
+    or an error lists the ids where two share frame numbers."""
     frame_offset: int = 0
     """Number of frames added to a keyframe's number, where the map counts from elsewhere: -1 where it counts from 1 and
-    the frames from 0. More make later frames of the keyframes."""
+    the frames from 0. A larger one matches each keyframe with a later frame."""
     map_fps: float | None = None
-    """Number of frames per second by which the map's times are counted; it wins over the map's own. A higher one makes
-    later frames of them."""
+    """Frames per second by which a map's times, in seconds, become frame numbers; it wins over the map's own rate and
+    the frames' stamps, unless both are on one clock such as Unix time. A higher one gives each time a later frame; maps
+    that name frames by number do not need it."""
     time_offset: float | None = None
     """What the map's clock shows at the time 0 of the frames, seconds; left out, it is found where the clock is
     another one, such as Unix time, and said. A larger one makes earlier frames of the keyframes."""
