@@ -1,4 +1,4 @@
-"""What a refusal says, told by its fields: where, what was found there, and the cure."""
+"""What a refusal says, told by its fields: where, what was found there, and the cure; and what a warning names."""
 
 from __future__ import annotations
 
@@ -24,3 +24,12 @@ def refused(*said: str, where: str = "", found: str = "", cure: str = "") -> Ite
     assert cure in error.cure, f"cure: {error}"
     for text in (part for one in said for part in one.split(" … ")):
         assert any(text in field for field in (error.where, error.found, error.cure)), f"{text!r}: {error}"
+
+
+@contextmanager
+def warned(*named: str) -> Iterator[pytest.WarningsRecorder]:
+    """The block warns of something in one sentence that names all of these."""
+    with pytest.warns(UserWarning) as seen:
+        yield seen
+    messages = [str(w.message) for w in seen]
+    assert any(all(name in message for name in named) for message in messages), messages

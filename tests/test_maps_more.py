@@ -8,7 +8,7 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
-from raising import refused
+from raising import refused, warned
 from scipy.spatial.transform import Rotation
 from test_maps import FISHEYE, PINHOLE, assert_equal_maps, edit, refusal, scene
 
@@ -246,7 +246,7 @@ def test_a_third_radial_term_is_read_exactly_and_radial_division_as_the_nearest_
         content["cameras"]["camera 0"].update(model_type="RadialDivision", distortion=-0.1)
 
     path = stella(tmp_path / "division.msg", division)
-    with pytest.warns(UserWarning, match=r"cameras.camera 0: DIVISION lens read as .*\(largest\)"):
+    with warned("camera 0", "DIVISION", "largest"):
         camera = read_map(path).submaps[0].keyframes[0].camera
     where = np.array([0.3, -0.2])  # on the plane of the lens, x = (u - cx) / fx
     ray = np.append(where / (1 - 0.1 * where @ where), 1)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import get_args, get_origin
 
 import pytest
+from raising import warned
 
 from lightdepth.cli import GROUP, main, verb_parser
 from lightdepth.command_line.gone_settings import without_gone
@@ -252,7 +253,7 @@ def test_an_option_that_is_gone_is_said_to_be_on_the_command_line_and_left_out_o
     words = ["-o", "O", "--trainer.limit-test-batches", "2"]
     assert "--trainer.limit-test-batches is no more (it had no effect): leave it out" in told("train", words, capsys)
     (tmp_path / "c.yaml").write_text("trainer.limit-test-batches: 2\ntrainer: {barebones: true, max-steps: 7}\n")
-    with pytest.warns(UserWarning, match="limit_test_batches .*barebones"):
+    with warned("limit_test_batches", "barebones"):
         (text,) = without_gone("train", [f"--config={tmp_path / 'c.yaml'}"])
     assert text == "--config=trainer:\n  max_steps: 7\n"
 

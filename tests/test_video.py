@@ -11,7 +11,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from raising import refused
+from raising import refused, warned
 from torch.utils.data import DataLoader, Dataset
 from videos import CAMERA, OCTAGON, picture, uneven_times, write_video
 
@@ -127,7 +127,7 @@ def test_a_video_is_a_sequence_with_what_lies_beside_it(with_camera):
 
 
 def test_the_black_border_of_a_video_is_said(with_camera):
-    with pytest.warns(UserWarning, match="is a black border, which is left out"):
+    with warned("black border"):
         open_sequence(with_camera)
 
 
@@ -243,7 +243,7 @@ def test_pixels_are_the_stored_ones_whatever_turn_the_file_asks_for(videos, tmp_
     assert (video.width, video.height) == (256, 208) and video.rotation in (90, 270)
     np.testing.assert_array_equal(video.read(4), VideoFile(videos["mp4"]).read(4))
     write_camera(CAMERA, tmp_path / "camera.json")
-    with pytest.warns(UserWarning, match="a flag asks players to turn the pictures by [0-9]+ degrees; it is left"):
+    with warned("a flag", "degrees"):
         assert open_sequence(path)[4].image.shape == (208, 256, 3)
     write_camera(CAMERA.resized(256, 208).cropped(0, 0, 208, 256), tmp_path / "turned.json")
     with refused(found="the calibration is of the turned 208x256", cure="turn the pixels for good"):
