@@ -66,6 +66,6 @@ def test_a_file_system_that_cannot_sync_folders_loses_nothing_and_a_full_one_is_
     write_whole(tmp_path / "a", "x")
     assert (tmp_path / "a").read_text() == "x"
     monkeypatch.setattr(os, "fsync", failing(errno.ENOSPC))
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(OSError, match="No space left"):  # the machine's failure, not the user's
         write_whole(tmp_path / "a", "y")
-    assert "No space left" in refused.value.found and (tmp_path / "a").read_text() == "x"
+    assert (tmp_path / "a").read_text() == "x"

@@ -13,6 +13,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from lightdepth.errors import InputError
+from lightdepth.files.machine import FAILS
 
 Content = str | bytes | Callable[[Path], object]
 """Text, bytes, or a function that writes a file at the path that it is given (the ending is that of the real one)."""
@@ -43,18 +44,25 @@ def write_together(contents: Mapping[Path, Content]) -> None:
             for folder in {path.parent for path in contents}:
                 sync(folder)
         except OSError as error:
+            if error.errno in FAILS:
+                raise  # no other place is better, or all are: the command line says which disk, and what is free
             where = error.filename or next(iter(contents))
             raise InputError(where, f"cannot be written ({error.strerror or error})", "choose another place") from error
 
 
 def move_whole(made: Path, path: Path) -> None:
     """A finished folder takes its place: all that is in it is on the disk before it does."""
+    sync_below(made)
+    made.rename(path)
+    sync(path.parent)
+
+
+def sync_below(made: Path) -> None:
+    """Brings all that is in a folder to the disk."""
     for folder, _, files in os.walk(made):
         for file in files:
             sync(Path(folder) / file)
         sync(Path(folder))
-    made.rename(path)
-    sync(path.parent)
 
 
 def sync(path: Path) -> None:
