@@ -126,12 +126,16 @@ def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
     from lightdepth.command_line.gone_settings import without_gone
     from lightdepth.command_line.options import with_groups
-    from lightdepth.command_line.parsing import fail, parsed
+    from lightdepth.command_line.parsing import config_files, fail, parsed
     from lightdepth.command_line.presets import with_preset
+    from lightdepth.files.replacing import check_apart
 
     parser = verb_parser(function, verb)
     argv = without_gone(verb, with_preset(verb, argv, partial(fail, parser)))
-    return with_groups(function, parser.instantiate(parsed(parser, argv)))
+    found = parsed(parser, argv)
+    if found.get("overwrite") and found.get("output"):
+        check_apart(Path(found["output"]), config_files(argv))
+    return with_groups(function, parser.instantiate(found))
 
 
 def verb_parser(function: Any, verb: str) -> Parser:

@@ -56,6 +56,16 @@ def is_live(output: Path) -> bool:
         os.close(descriptor)
 
 
+def is_lock(path: Path) -> bool:
+    """Whether a file is a lock of ours."""
+    try:
+        with path.open("rb") as file:
+            found = _read(file.fileno())
+    except OSError:
+        return False
+    return {"host", "pid", "time"} <= set(found)
+
+
 def _opened(path: Path, output: Path) -> int:
     """The lock file, held."""
     while True:

@@ -17,11 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from lightdepth.errors import InputError
-from lightdepth.files.lock import is_live, lock_path
-from lightdepth.files.writing import move_whole, sync
+from lightdepth.files.lock import is_live, is_lock, lock_path
+from lightdepth.files.writing import PARTIAL, check_writable, is_dead_partial, move_whole, sync
 
 RECORD = "run.json"
 """The file that says that a folder is the whole result of a run, of which verb, and which files are the run's."""
+
+BEGUN = "begun.json"
+"""What an unfinished run was begun with."""
 
 _LONGEST = 240
 """The longest name of an output, in bytes: file systems take 255, and its hidden neighbours have longer names."""
@@ -143,9 +146,36 @@ def check_apart(output: Path, inputs: Iterable[Path]) -> None:
     """Raises InputError when the output is one of the inputs, or holds one."""
     output = output.resolve()
     for path in inputs:
-        with suppress(OSError, ValueError, RuntimeError):  # no path of ours: too long, or links in a circle
-            if path.exists() and path.resolve().is_relative_to(output):
-                raise InputError(output, f"not overwritten, {path} is read from it", "choose another -o")
+        try:
+            inside = path.exists() and path.resolve().is_relative_to(output)
+        except (OSError, ValueError, RuntimeError):  # no path after all: too long, or links in a circle
+            continue
+        if inside:
+            raise InputError(output, f"not overwritten, {path} is read from it", "choose another -o")
+
+
+def check_files(paths: Iterable[Path], overwrite: bool, inputs: Iterable[Path | None] = ()) -> None:
+    """Raises InputError, before any work, unless these files can be written: none is an input or a folder, none is
+    there already without `overwrite`, and their folders take files."""
+    given = [path for path in inputs if path is not None]
+    for path in paths:
+        if path.is_dir():
+            raise InputError(path, "is a folder", "expected the name of a file to write")
+        if path.exists():
+            if not overwrite:
+                raise InputError(path, "already there", "choose another -o, or give --overwrite")
+            check_apart(path, given)
+        check_writable(path)
+
+
+def check_rewritable(path: Path, beginning: str, inputs: Iterable[Path | None] = ()) -> None:
+    """Raises InputError, before any work, where a file is to be written that no earlier run wrote: what is there does
+    not begin as ours do."""
+    if path.is_file():
+        with path.open(encoding="utf-8", errors="replace") as file:
+            if not file.read(len(beginning)) == beginning:
+                raise InputError(path, "is there already, and was not made by this verb", "choose another name")
+    check_files([path], True, inputs)
 
 
 def replace(made: Path, output: Path, before: Stamp) -> None:
@@ -197,11 +227,16 @@ def remove_owned(folder: Path) -> bool:
     return not folder.exists()
 
 
+def hidden(path: Path) -> bool:
+    """Whether a name is one that this program hides what it is writing under."""
+    return path.name.startswith(PARTIAL) or _output_of(path) is not None
+
+
 def remains(parent: Path) -> Iterator[Path]:
     """What dead runs left in a folder, hidden: unfinished results, results moved aside, locks, parts of files."""
     for path in sorted(parent.glob(".*")):
         output = _output_of(path)
-        if output is not None and not is_live(output):
+        if is_dead_partial(path) or (output is not None and not is_live(output) and _is_of_a_run(path)):
             yield path
 
 
@@ -216,6 +251,13 @@ def _output_of(path: Path) -> Path | None:
         if path.suffix == ending and len(path.name) > len(ending) + 1:
             return path.with_name(path.name[1 : -len(ending)])
     return None
+
+
+def _is_of_a_run(path: Path) -> bool:
+    """Whether what has such a name was written by this program: others hide files too."""
+    if path.is_dir():
+        return (path / BEGUN).is_file() or (path / "log.txt").is_file() or read_record(path) is not None
+    return path == lock_path(_output_of(path) or path) and is_lock(path)
 
 
 def _owned(folder: Path) -> set[Path]:

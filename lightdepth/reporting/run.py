@@ -6,31 +6,28 @@ files. A verb that fails leaves OUT as it was; one that can be resumed keeps its
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
 import platform
 import resource
 import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
-from lightdepth.errors import AlreadyFinished, InputError, PartialFailure
+from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.lock import locked
 from lightdepth.files.machine import machine_failure
 from lightdepth.files.replacing import (
+    BEGUN,
     check_apart,
     check_replaceable,
     discard,
     listed,
-    read_record,
     real_output,
     recover,
     replace,
@@ -39,8 +36,11 @@ from lightdepth.files.replacing import (
     unfinished_path,
 )
 from lightdepth.files.writing import sync_below, write_whole
+from lightdepth.reporting.same import check_finished, check_same, compared
+from lightdepth.reporting.same import input_hash as input_hash
+from lightdepth.reporting.same import paths_in as paths_in
+from lightdepth.reporting.same import plain as plain
 from lightdepth.reporting.unfinished import (
-    BEGUN,
     PARTS,
     Part,
     add_part,
@@ -66,12 +66,18 @@ PACKAGES = (
 
 
 class Run:
-    """An output folder in the making. `folder` is where to write; `record` is what run.json will say besides."""
+    """An output folder in the making. `folder` is where to write, `output` what it becomes; `record` is what run.json
+    will say besides."""
 
     def __init__(
-        self, folder: Path, verb: str, arguments: Mapping[str, Any], parts: Mapping[str, Part] | None = None
+        self,
+        folder: Path,
+        output: Path,
+        verb: str,
+        arguments: Mapping[str, Any],
+        parts: Mapping[str, Part] | None = None,
     ) -> None:
-        self.folder = folder
+        self.folder, self.output = folder, output
         self.record: dict[str, Any] = {"failures": [], "warnings": []}
         self.parts = None if parts is None else dict(parts)
         self.resumed = bool(parts)
@@ -137,9 +143,12 @@ class Run:
         """Notes what files and folders were read, by name; None is one that was not given."""
         for name, path in paths.items():
             if path is not None:
-                self.record.setdefault("inputs", {})[name] = {"path": str(path), "sha256": input_hash(path)}
+                self.record.setdefault("inputs", {})[name] = {
+                    "path": str(path),
+                    "sha256": input_hash(path, self.output),
+                }
         if self.parts is not None and not self.resumed:
-            arguments = _compared(self._arguments)
+            arguments = compared(self._arguments)
             begin(self.folder, {"verb": self._verb, "arguments": arguments, "inputs": self.record.get("inputs", {})})
 
     @contextmanager
@@ -184,12 +193,18 @@ def recorded(*groups: object, **options: object) -> dict[str, object]:
 
 @contextmanager
 def run_folder(
-    output: Path, verb: str, arguments: Mapping[str, Any], overwrite: bool = False, resume: bool | None = None
+    output: Path,
+    verb: str,
+    arguments: Mapping[str, Any],
+    overwrite: bool = False,
+    resume: bool | None = None,
+    inputs: Sequence[object] = (),
 ) -> Iterator[Run]:
     """A Run whose folder becomes `output` when the block ends well.
 
     `resume` None: a verb that cannot be resumed; what it wrote goes when the block fails. Else finished parts
-    (`Run.finish_part`) are kept when it is killed or the machine fails, and `resume` True goes on from them. Raises
+    (`Run.finish_part`) are kept when it is killed or the machine fails, and `resume` True goes on from them. `inputs`
+    are those that do not stand among the arguments, which are looked through for others. Raises
     InputError when `output` is in use, is or holds an input, or holds what is not of such a run; AlreadyFinished;
     MachineFailure, with what was kept.
     """
@@ -200,7 +215,7 @@ def run_folder(
     try:
         real.parent.mkdir(parents=True, exist_ok=True)
         with locked(real):
-            run = _begun(real, verb, arguments, overwrite, resume)
+            run = _begun(real, verb, arguments, overwrite, resume, [*paths_in(arguments), *paths_in(inputs)])
             before = stamp(real)
             with _kept_or_gone(run, real, resume is not None), run.hearing():
                 yield run
@@ -221,17 +236,24 @@ def run_folder(
         )
 
 
-def _begun(output: Path, verb: str, arguments: Mapping[str, Any], overwrite: bool, resume: bool | None) -> Run:
+def _begun(
+    output: Path,
+    verb: str,
+    arguments: Mapping[str, Any],
+    overwrite: bool,
+    resume: bool | None,
+    inputs: Iterable[Path],
+) -> Run:
     """The run that is made or goes on, after all that can be refused before any work."""
     if recover(output):
         print(f"{output.name} was finished by an earlier run, which was killed at its last step", flush=True)
     made = unfinished_path(output)
     if output.is_dir() and any(output.iterdir()):
         if overwrite:
-            check_apart(output, paths_in(arguments))
+            check_apart(output, inputs)
             check_replaceable(output, verb)
         elif resume:
-            _check_finished(output, verb, arguments)
+            check_finished(output, verb, arguments)
         else:
             choices = "give --overwrite" if resume is None else "give --resume or --overwrite"
             raise InputError(output, "already there and not empty", f"choose another -o, or {choices}")
@@ -240,7 +262,7 @@ def _begun(output: Path, verb: str, arguments: Mapping[str, Any], overwrite: boo
         if not resume:
             cure = f"--overwrite starts anew, and {begun['verb']} --resume goes on"
             raise InputError(output, f"holds an unfinished run of {begun['verb']}", cure)
-        _check_same(output, begun, verb, arguments)
+        check_same(output, begun, verb, arguments)
     else:
         parts = {}
         discard(made)
@@ -249,14 +271,14 @@ def _begun(output: Path, verb: str, arguments: Mapping[str, Any], overwrite: boo
     try_place(output)
     if parts:
         clean(made, parts)
-        run = Run(made, verb, arguments, parts)
+        run = Run(made, output, verb, arguments, parts)
         run.log(f"resumed: {len(parts)} finished part(s) are kept")
         return run
     made.mkdir(mode=0o755)
     made.chmod(0o755)
     if resume is not None:
-        begin(made, {"verb": verb, "arguments": _compared(arguments), "inputs": {}})
-    return Run(made, verb, arguments, {} if resume is not None else None)
+        begin(made, {"verb": verb, "arguments": compared(arguments), "inputs": {}})
+    return Run(made, output, verb, arguments, {} if resume is not None else None)
 
 
 @contextmanager
@@ -275,52 +297,6 @@ def _kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
         if failure is not None:
             raise failure from error
         raise
-
-
-def _check_finished(output: Path, verb: str, arguments: Mapping[str, Any]) -> None:
-    """Raises AlreadyFinished when the same run is finished there, else InputError."""
-    record = read_record(output)
-    if record is None:
-        raise InputError(output, "not resumed, it holds no run of this program", "choose another -o")
-    _check_same(output, record, verb, arguments)
-    raise AlreadyFinished(f"{output.name} is already finished")
-
-
-def _check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Mapping[str, Any]) -> None:
-    """Raises InputError, naming what differs, unless this is the run that was begun there."""
-    if begun["verb"] != verb:
-        raise InputError(output, f"not resumed, it is of {begun['verb']}, not of {verb}", "choose another -o")
-    now, then = _compared(arguments), _compared(begun.get("arguments") or {})
-    for name in dict.fromkeys([*now, *then]):
-        if now.get(name) != then.get(name):
-            found = f"not resumed, --{name.replace('_', '-')} was {then.get(name)!r} and is {now.get(name)!r}"
-            raise InputError(output, found, "give the same options, or --overwrite to start anew")
-    for name, known in (begun.get("inputs") or {}).items():
-        path = Path(str(arguments.get(name) or known.get("path") or ""))
-        if "sha256" in known and not (path.exists() and input_hash(path) == known["sha256"]):
-            raise InputError(output, f"not resumed, {name} has changed since", "--overwrite starts anew")
-
-
-def _compared(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments that decide what comes out, as JSON reads them back."""
-    chosen = {name: value for name, value in arguments.items() if name not in ("output", "overwrite", "resume")}
-    same: dict[str, Any] = json.loads(json.dumps(plain(chosen)))
-    return same
-
-
-def paths_in(value: Any) -> list[Path]:
-    """Every path among arguments, also in lists and groups; text counts, as it may name one. Not the output's."""
-    if isinstance(value, Path):
-        return [value]
-    if isinstance(value, str):
-        return [Path(value)] if value and "\0" not in value else []
-    if is_dataclass(value) and not isinstance(value, type):
-        return paths_in(vars(value))
-    if isinstance(value, Mapping):
-        return [path for name, each in value.items() if name != "output" for path in paths_in(each)]
-    if isinstance(value, list | tuple | set | frozenset):
-        return [path for each in value for path in paths_in(each)]
-    return []
 
 
 def write_run_json(
@@ -366,33 +342,3 @@ def git_revision() -> str | None:
         return None
     result: str | None = revision + ("+" if changed else "")
     return result
-
-
-def input_hash(path: Path) -> str:
-    """SHA-256 over names and sizes of the files below a path, and over the contents of those up to 1 MB."""
-    digest = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        size = file.stat().st_size
-        name = file.relative_to(path) if path.is_dir() else file.name
-        digest.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape"))
-        if size <= 1 << 20:
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
-
-
-def plain(value: Any) -> Any:
-    """Dataclasses, paths, tuples and numpy scalars as what JSON and YAML know."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return plain(asdict(value))
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None  # JSON has neither NaN nor infinity
-    return value

@@ -13,9 +13,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lightdepth.files.replacing import BEGUN
 from lightdepth.files.writing import sync, write_whole
 
-BEGUN, PARTS, LOG = "begun.json", "parts.jsonl", "log.txt"
+PARTS, LOG = "parts.jsonl", "log.txt"
 
 
 @dataclass(frozen=True)
