@@ -65,16 +65,16 @@ def stamp(output: Path) -> Stamp:
 def real_output(output: Path) -> Path:
     """The folder that an output names, links followed. Raises InputError for what can never become a run folder."""
     output = Path(output)
+    if (length := len(os.fsencode(output.name))) > _LONGEST:
+        raise InputError(_short(output), f"its name has {length} bytes", f"expected up to {_LONGEST}")
     try:
         if output.is_symlink() and not output.exists():
             raise InputError(output, "is a link to nothing", "choose another -o, or make the folder that it names")
         real = output.resolve()
-    except (OSError, RuntimeError) as error:  # a name too long; links in a circle
-        raise InputError(_short(output), f"cannot be made ({error})", "choose another -o") from error
-    if len(os.fsencode(real.name)) > _LONGEST:
-        raise InputError(
-            _short(output), f"its name has {len(os.fsencode(real.name))} bytes", f"expected up to {_LONGEST}"
-        )
+    except OSError as error:
+        raise InputError(_short(output), f"cannot be made ({error.strerror})", "choose another -o") from error
+    except RuntimeError as error:
+        raise InputError(_short(output), "cannot be made (links in a circle)", "choose another -o") from error
     if real.exists() and not real.is_dir():
         raise InputError(output, "is a file", "expected a folder to make")
     if real == real.parent or Path.cwd().resolve().is_relative_to(real):
