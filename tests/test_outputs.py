@@ -141,7 +141,8 @@ def test_the_old_result_comes_back_when_a_run_was_killed_before_the_new_one_was_
     out, _ = old_and_new(tmp_path)
     out.rename(old_path(out))
     unfinished_path(out).mkdir()
-    (unfinished_path(out) / "half.txt").write_text("")
+    for name in ("half.txt", "begun.json"):
+        (unfinished_path(out) / name).write_text("")
     with refused("already there"):
         make(out)
     assert text_of(out) == "old"
@@ -170,7 +171,16 @@ def test_an_old_result_whose_removal_was_cut_off_goes_but_not_what_is_not_its_ow
     (tmp_path / "other").rename(old_path(out))
     with refused("already there"):
         make(out)
-    assert left_in(old_path(out)) == ["mine.txt"]
+    assert left_in(tmp_path) == ["out", "out.1"] and left_in(tmp_path / "out.1") == ["mine.txt"]
+
+
+@pytest.mark.parametrize("hidden", [old_path, unfinished_path])
+def test_a_folder_of_another_program_with_a_name_like_ours_is_left_alone(tmp_path, hidden):
+    (hidden(tmp_path / "out")).mkdir()
+    (hidden(tmp_path / "out") / "mine.txt").write_text("")
+    with refused("not made by this program", cure="another -o"):
+        make(tmp_path / "out")
+    assert left_in(hidden(tmp_path / "out")) == ["mine.txt"] and not list(remains(tmp_path))
 
 
 @pytest.mark.parametrize("step", range(6))

@@ -23,8 +23,8 @@ from lightdepth.files.writing import PARTIAL, check_writable, is_dead_partial, m
 RECORD = "run.json"
 """The file that says that a folder is the whole result of a run, of which verb, and which files are the run's."""
 
-BEGUN = "begun.json"
-"""What an unfinished run was begun with."""
+BEGUN, PARTS = "begun.json", "parts.jsonl"
+"""In an unfinished run: what it was begun with, which also says that the folder is ours; and its finished parts."""
 
 _LONGEST = 240
 """The longest name of an output, in bytes: file systems take 255, and its hidden neighbours have longer names."""
@@ -121,7 +121,8 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 
 def listed(folder: Path) -> dict[str, int]:
     """Every file below a folder, links too, with its size in bytes: names as run.json has them, in order."""
-    return {str(p.relative_to(folder)): p.lstat().st_size for p in sorted(_files(folder)) if p != folder / RECORD}
+    own = {folder / name for name in (RECORD, BEGUN, PARTS)}
+    return {str(p.relative_to(folder)): p.lstat().st_size for p in sorted(_files(folder)) if p not in own}
 
 
 def check_replaceable(output: Path, verb: str) -> None:
@@ -193,23 +194,35 @@ def replace(made: Path, output: Path, before: Stamp) -> None:
         sync(output.parent)
     move_whole(made, output)
     if aside.is_dir():
-        remove_owned(aside)
+        _remove_old(aside, output)
 
 
 def recover(output: Path) -> bool:
     """Finishes what a run that died at its last step had begun: what was there comes back, or goes. Only for whoever
     holds the lock. Returns whether a finished result took its place now."""
     made, aside = unfinished_path(output), old_path(output)
-    complete = (made / RECORD).is_file()
+    for path in (made, aside):
+        if path.exists() and not (read_record(path) or (path / BEGUN).is_file() or not any(path.iterdir())):
+            found = f"{path.name} beside it is in the way, and was not made by this program"
+            raise InputError(output, found, "rename it, or choose another -o")
+    complete = read_record(made) is not None
     empty = not output.exists() or (output.is_dir() and not any(output.iterdir()))
     if aside.is_dir() and empty and not complete:
         os.rename(aside, output)
         return False
     if complete and empty:
+        for name in (BEGUN, PARTS):
+            (made / name).unlink(missing_ok=True)
         move_whole(made, output)
     if aside.is_dir():
-        remove_owned(aside)
+        _remove_old(aside, output)
     return complete and empty
+
+
+def _remove_old(aside: Path, output: Path) -> None:
+    """What was there goes; of what others put into it meanwhile nothing does, and it shows itself again."""
+    if not remove_owned(aside):
+        os.rename(aside, _spare(output))
 
 
 def remove_owned(folder: Path) -> bool:
@@ -229,13 +242,13 @@ def remove_owned(folder: Path) -> bool:
 
 def hidden(path: Path) -> bool:
     """Whether a name is one that this program hides what it is writing under."""
-    return path.name.startswith(PARTIAL) or _output_of(path) is not None
+    return path.name.startswith(PARTIAL) or output_of(path) is not None
 
 
 def remains(parent: Path) -> Iterator[Path]:
     """What dead runs left in a folder, hidden: unfinished results, results moved aside, locks, parts of files."""
     for path in sorted(parent.glob(".*")):
-        output = _output_of(path)
+        output = output_of(path)
         if is_dead_partial(path) or (output is not None and not is_live(output) and _is_of_a_run(path)):
             yield path
 
@@ -245,7 +258,8 @@ def discard(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _output_of(path: Path) -> Path | None:
+def output_of(path: Path) -> Path | None:
+    """The output that something hidden is beside, by its name; None for other names."""
     for made in (unfinished_path, old_path, lock_path):
         ending = made(Path("x")).suffix
         if path.suffix == ending and len(path.name) > len(ending) + 1:
@@ -256,8 +270,8 @@ def _output_of(path: Path) -> Path | None:
 def _is_of_a_run(path: Path) -> bool:
     """Whether what has such a name was written by this program: others hide files too."""
     if path.is_dir():
-        return (path / BEGUN).is_file() or (path / "log.txt").is_file() or read_record(path) is not None
-    return path == lock_path(_output_of(path) or path) and is_lock(path)
+        return (path / BEGUN).is_file() or read_record(path) is not None
+    return path == lock_path(output_of(path) or path) and is_lock(path)
 
 
 def _owned(folder: Path) -> set[Path]:

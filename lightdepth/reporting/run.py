@@ -24,6 +24,7 @@ from lightdepth.files.lock import locked
 from lightdepth.files.machine import machine_failure
 from lightdepth.files.replacing import (
     BEGUN,
+    PARTS,
     check_apart,
     check_replaceable,
     discard,
@@ -41,7 +42,6 @@ from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
 from lightdepth.reporting.same import plain as plain
 from lightdepth.reporting.unfinished import (
-    PARTS,
     Part,
     add_part,
     begin,
@@ -179,10 +179,10 @@ class Run:
         import yaml
 
         (self.folder / "config.yaml").write_text(yaml.safe_dump(self._arguments, sort_keys=False), encoding="utf-8")
-        for name in (BEGUN, PARTS):
-            (self.folder / name).unlink(missing_ok=True)
         sync_below(self.folder)  # run.json says that the rest is whole: it comes last
         write_run_json(self.folder, self._verb, self._arguments, self._start, self.record)
+        for name in (BEGUN, PARTS):
+            (self.folder / name).unlink(missing_ok=True)
 
 
 def recorded(*groups: object, **options: object) -> dict[str, object]:
@@ -227,7 +227,8 @@ def run_folder(
             raise failure from error
         if run is not None:
             raise
-        raise InputError(output, f"cannot be made ({error.strerror})", "choose another -o") from error
+        cure = f"give a folder in it: -o {output / 'run'}" if real.is_dir() else "choose another -o"
+        raise InputError(output, f"cannot be made ({error.strerror})", cure) from error
     if run.record["failures"]:
         first = run.record["failures"][0]
         raise PartialFailure(
@@ -276,8 +277,7 @@ def _begun(
         return run
     made.mkdir(mode=0o755)
     made.chmod(0o755)
-    if resume is not None:
-        begin(made, {"verb": verb, "arguments": compared(arguments), "inputs": {}})
+    begin(made, {"verb": verb, "arguments": compared(arguments), "inputs": {}})
     return Run(made, output, verb, arguments, {} if resume is not None else None)
 
 

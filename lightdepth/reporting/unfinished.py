@@ -13,10 +13,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lightdepth.files.replacing import BEGUN
+from lightdepth.files.replacing import BEGUN, PARTS
 from lightdepth.files.writing import sync, write_whole
 
-PARTS, LOG = "parts.jsonl", "log.txt"
+LOG = "log.txt"
 
 
 @dataclass(frozen=True)

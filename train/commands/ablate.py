@@ -29,6 +29,7 @@ from lightdepth.files.replacing import (
 )
 from lightdepth.reporting.run import recorded, write_run_json
 from lightdepth.reporting.same import paths_in
+from lightdepth.reporting.unfinished import begin
 
 from ..ablation.judge import Judge
 from ..ablation.plan import check, check_apart, plans_of
@@ -86,11 +87,13 @@ def ablate(
             replacing.check_apart(real, paths_in({**arguments, "table": None}))
             check_replaceable(real, "ablate")
             place = unfinished_path(real)  # the old one stays until the new one is whole
+            begin(place, {"verb": "ablate"})
         else:
             _check_ours(real)
             place = real
         failed = _ablate(place, base, settings, rows, judged, seeds, table, arguments)
         if place != real:
+            (place / replacing.BEGUN).unlink(missing_ok=True)
             replacing.replace(place, real, before)
     say(f"table: {table or output / 'ablation.md'}")
     if failed:
