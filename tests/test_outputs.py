@@ -24,6 +24,8 @@ from lightdepth.files.replacing import check_rewritable, old_path, remains, unfi
 from lightdepth.files.writing import write_whole
 from lightdepth.reporting.run import input_hash, paths_in, run_folder, write_run_json
 
+ROOT = Path(__file__).resolve().parents[1]
+
 
 def make(output: Path, text: str = "new", verb: str = "densify", arguments=None, **given) -> None:
     with run_folder(output, verb, arguments or {"seed": 3}, **given) as run:
@@ -134,7 +136,53 @@ def test_the_config_file_of_a_run_is_not_overwritten_by_it(tmp_path, capsys):
     assert "config.yaml is read from it" in capsys.readouterr().err and text_of(tmp_path / "out") == "old"
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["predict", "D", "--checkpoint", "decline"],
+        ["import", "D"],
+        ["sparse", "D"],
+        ["densify", "D", "--map", "D/slam", "--checkpoint", "decline"],
+        ["densify", "data", "--map", "D", "--checkpoint", "decline"],
+        ["live", "data", "--map", "data", "--checkpoint", "decline", "--mask", "D/mask.png"],
+        ["export", "D", "--to", "png"],
+        ["predict", "data", "--checkpoint", "D/result.txt"],
+    ],
+    ids=" ".join,
+)
+def test_no_verb_overwrites_what_it_is_given(words, tmp_path, monkeypatch, capsys):
+    make(tmp_path / "D", "old", verb=words[0])
+    (tmp_path / "data").mkdir()
+    for name in ("slam", "mask.png", "1.npz"):
+        (tmp_path / "D" / name).write_text("precious")
+    monkeypatch.chdir(tmp_path)
+    assert main([*words, "-o", "D", "--overwrite"]) == 3
+    assert text_of(tmp_path / "D") == "old" and len(left_in(tmp_path / "D")) == 6
+    assert left_in(tmp_path) == ["D", "data"], capsys.readouterr().err
+
+
 # ---- killed between two steps
+
+
+def test_a_run_that_was_killed_goes_on_in_another_process(tmp_path):
+    program = """
+import os, signal
+from pathlib import Path
+from lightdepth.reporting.run import run_folder
+with run_folder(Path("out"), "predict", {"seed": 3}, resume=False) as run:
+    for i in range(2):
+        assert not run.done(str(i))
+        (run.folder / f"{i}.txt").write_text(str(i))
+        run.finish_part(str(i))
+    (run.folder / "torn.txt").write_text("ha")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert done.returncode == -9 and left_in(tmp_path) == [".out.lock", ".out.unfinished"]
+    assert [p.name for p in remains(tmp_path)] == [".out.lock", ".out.unfinished"] and not is_live(tmp_path / "out")
+    with run_folder(tmp_path / "out", "predict", {"seed": 3}, resume=True) as run:
+        assert run.resumed and run.done("0") and run.done("1") and not run.done("2")
+    assert left_in(tmp_path) == ["out"] and "torn.txt" not in left_in(tmp_path / "out")
 
 
 def test_the_old_result_comes_back_when_a_run_was_killed_before_the_new_one_was_in(tmp_path):
@@ -241,6 +289,12 @@ def test_places_that_cannot_take_a_folder_are_refused_before_any_work(tmp_path, 
     assert not work and left_in(tmp_path) == ["circle", "loose", "mine", "mount"]
 
 
+def test_folders_that_were_made_for_an_output_go_with_it(tmp_path):
+    with pytest.raises(InputError), run_folder(tmp_path / "a" / "b" / "out", "densify", {}):
+        raise InputError("a", "0", "give 1")
+    assert left_in(tmp_path) == []
+
+
 def test_a_link_to_a_folder_goes_on_leading_to_it(tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "out").symlink_to(tmp_path / "disk" / "out")
@@ -315,7 +369,7 @@ except Exception as error:
     done = subprocess.run(
         [sys.executable, "-B", "-c", program],
         cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, 1 << 16)),

@@ -18,7 +18,7 @@ from typing import Any
 
 from lightdepth.errors import InputError
 from lightdepth.files.lock import is_live, is_lock, lock_path
-from lightdepth.files.writing import PARTIAL, check_writable, is_dead_partial, move_whole, sync
+from lightdepth.files.writing import PARTIAL, check_writable, is_dead_partial, move_whole, sync, sync_below
 
 RECORD = "run.json"
 """The file that says that a folder is the whole result of a run, of which verb, and which files are the run's."""
@@ -189,10 +189,16 @@ def replace(made: Path, output: Path, before: Stamp) -> None:
         move_whole(made, spare)
         raise InputError(output, "was changed by another program during this run", f"the result is in {spare}")
     aside = old_path(output)
+    sync_below(made)  # so that the time between the two renames is short
     if output.is_dir() and any(output.iterdir()):
         os.rename(output, aside)
-        sync(output.parent)
-    move_whole(made, output)
+    try:
+        os.rename(made, output)
+    except OSError:
+        if aside.is_dir():
+            os.rename(aside, output)
+        raise
+    sync(output.parent)
     if aside.is_dir():
         _remove_old(aside, output)
 

@@ -14,7 +14,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
@@ -213,8 +213,7 @@ def run_folder(
     real = real_output(output)
     run = None
     try:
-        real.parent.mkdir(parents=True, exist_ok=True)
-        with locked(real):
+        with _parents(real), locked(real):
             run = _begun(real, verb, arguments, overwrite, resume, [*paths_in(arguments), *paths_in(inputs)])
             before = stamp(real)
             with _kept_or_gone(run, real, resume is not None), run.hearing():
@@ -235,6 +234,20 @@ def run_folder(
             f"{len(run.record['failures'])} part(s) failed, the first: {first['what']}: {first['reason']}. "
             f"The rest is in {output}"
         )
+
+
+@contextmanager
+def _parents(output: Path) -> Iterator[None]:
+    """Makes the folders that an output is to be in; those that it made go where the block fails and leaves nothing."""
+    missing = [folder for folder in output.parents if not folder.exists()]
+    output.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for folder in missing:
+            with suppress(OSError):  # something is kept in it
+                folder.rmdir()
+        raise
 
 
 def _begun(
@@ -294,6 +307,8 @@ def _kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
             discard(run.folder)
         elif failure is None:
             error.add_note(said)
+            if hasattr(error, "kept"):  # a signal, which is told with it
+                error.kept = said
         if failure is not None:
             raise failure from error
         raise
