@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from densify.fusion.compiled import cache_folder, open_to_others
 from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth import native
@@ -30,7 +31,7 @@ def examine() -> list[Check]:
     needed = ("torch", "lightning", "kornia", "numpy", "scipy", "pycolmap", "opencv-python-headless")
     findings = [Check("python", True, f"{found['python']} on {platform.machine()}, {os.cpu_count()} cores")]
     findings += [Check(name, name in found, found.get(name, f"missing: pip install {name}")) for name in needed]
-    findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), _torchvision()]
+    findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), _machine_code(), _torchvision()]
     return findings
 
 
@@ -64,6 +65,17 @@ def _pycolmap() -> Check:
     except ImportError as error:
         return Check("pycolmap calls", False, f"{error}: pip install 'pycolmap>=4'")
     return Check("pycolmap calls", not missing, f"lacks {', '.join(missing)}" if missing else "all there")
+
+
+def _machine_code() -> Check:
+    """Where compiled loops are kept: what lies there is loaded and run."""
+    folder = cache_folder()
+    if folder is None:
+        return Check("compiled loops", True, "made by each process: there is no home to keep them in")
+    if open_to_others(folder):
+        cure = f"what is in it is run: remove it, or chmod 700 {folder} once you know what it holds"
+        return Check("compiled loops", False, f"{folder} is another user's, or others may write to it; {cure}")
+    return Check("compiled loops", True, f"kept in {folder}")
 
 
 def _torchvision() -> Check:

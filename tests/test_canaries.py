@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from importlib import metadata
 from inspect import signature
 from typing import Any, get_args, get_type_hints
 
 import pytest
 import yaml
-from raising import warned
+from raising import refused, warned
 
+from densify.exporting.colmap import stem
 from lightdepth import plain_yaml
 from lightdepth.cli import GROUP, main, verb_parser
+from lightdepth.datasets.catalogue import inside
+from lightdepth.datasets.splits import located
+from lightdepth.reporting.report import Report
 from train.parser import training_parser
 
 CODE = "open({!r}, 'w').close()\nclass Thing: pass\n"
@@ -167,3 +171,68 @@ def test_a_value_on_the_command_line_is_bounded_as_a_file_is(capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["densify", "D", "-o", "O", "--merging", BOMB])
     assert stopped.value.code == 2 and len(capsys.readouterr().err) < 3000
+
+
+def test_a_split_reads_no_folder_that_a_link_out_of_its_root_leads_to(canary, tmp_path):
+    for folder in ("root/a", "elsewhere/b"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "root" / "b").symlink_to(tmp_path / "elsewhere" / "b")
+    (tmp_path / "root" / "c").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "root" / "d").symlink_to(tmp_path / "root" / "a")
+    (tmp_path / "data").symlink_to(tmp_path / "root")  # the root itself is the user's to name
+    assert located(tmp_path / "data", "d") == tmp_path / "data" / "d"
+    for name in ("b", "c", "c/b"):
+        with refused(str(tmp_path / "elsewhere"), where=name):
+            located(tmp_path / "data", name)
+    for name in ("../elsewhere", "a/../../elsewhere", "/etc", "~", "C:x", "..\\elsewhere"):
+        with refused("leads outside"):
+            inside(name)
+
+
+HOSTILE_NAMES = [
+    "../../outside_1",
+    "/outside_1",
+    "..\\outside_1",
+    "-o",
+    "$(touch canary)_1",
+    "<script>x</script>_1",
+    "a\nb_1",
+]
+
+
+@pytest.mark.parametrize("name", HOSTILE_NAMES)
+def test_a_name_in_a_map_is_a_name_and_neither_a_path_nor_a_tag(name, canary, tmp_path):
+    written = tmp_path / "inside" / f"{stem(Named(name))}.png"
+    assert written.resolve().parent == (tmp_path / "inside").resolve()
+    page = Report(name)
+    page.text(name)
+    page.figures([(b"", f'{name}" onload="x')])
+    page.table([name], [[name]])
+    page.write(tmp_path / "report.html")
+    assert (
+        "<script" not in (tmp_path / "report.html").read_text()
+        and '" onload' not in (tmp_path / "report.html").read_text()
+    )
+
+
+@dataclass
+class Named:
+    name: str
+
+
+XML = {
+    "entities in entities": '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">'
+    + "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 9)).replace("&a0;", "&a;")
+    + "]><opencv_storage><a>&a8;</a></opencv_storage>",
+    "a file": '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]><opencv_storage><a>&a;</a></opencv_storage>',
+    "another's definitions": '<!DOCTYPE x SYSTEM "http://192.0.2.1/x.dtd"><opencv_storage/>',
+    "vicalib": '<!DOCTYPE rig [<!ENTITY a SYSTEM "canary">]><rig><camera>&a;</camera></rig>',
+}
+
+
+@pytest.mark.parametrize("case", XML)
+def test_xml_opens_no_file_and_grows_by_no_entity(case, canary, tmp_path, capsys):
+    (tmp_path / "camera.xml").write_text(XML[case])
+    assert main(["convert-camera", str(tmp_path / "camera.xml"), "-o", str(tmp_path / "camera.json")]) == 3
+    said = capsys.readouterr().err
+    assert "root:" not in said and len(said) < 1000 and not (tmp_path / "camera.json").exists()
