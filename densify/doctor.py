@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from densify.fusion.compiled import cache_folder, open_to_others
 from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth import native
@@ -36,7 +37,8 @@ def examine() -> list[Check]:
     needed = ("torch", "lightning", "kornia", "numpy", "scipy", "pycolmap", "opencv-python-headless")
     findings = [Check("python", True, f"{found['python']} on {platform.machine()}, {os.cpu_count()} cores")]
     findings += [Check(name, name in found, found.get(name, f"missing: pip install {name}")) for name in needed]
-    findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), _torchvision(), _remains(Path())]
+    findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), _machine_code(), _torchvision()]
+    findings += [_remains(Path())]
     return findings
 
 
@@ -92,6 +94,17 @@ def _folders_in(folder: Path) -> list[Path]:
         return sorted(p for p in folder.iterdir() if p.is_dir() and not hidden(p))[:_MOST_FOLDERS]
     except OSError:
         return []
+
+
+def _machine_code() -> Check:
+    """Where compiled loops are kept: what lies there is loaded and run."""
+    folder = cache_folder()
+    if folder is None:
+        return Check("compiled loops", True, "made by each process: there is no home to keep them in")
+    if open_to_others(folder):
+        cure = f"what is in it is run: remove it, or chmod 700 {folder} once you know what it holds"
+        return Check("compiled loops", False, f"{folder} is another user's, or others may write to it; {cure}")
+    return Check("compiled loops", True, f"kept in {folder}")
 
 
 def _torchvision() -> Check:

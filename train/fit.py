@@ -29,7 +29,7 @@ from lightning.pytorch.callbacks import (
     ModelCheckpoint,
     RichProgressBar,
 )
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from lightdepth.checkpoint import load_model, save_model
@@ -49,7 +49,16 @@ from .running import quiet, report_every
 from .trainer_options import check_trainer_options
 
 _OURS = (
-    *("config.yaml", "log.txt", "tensorboard", "checkpoints", "model.safetensors", "model.md", "uncertainty.png"),
+    *(
+        "config.yaml",
+        "log.txt",
+        "tensorboard",
+        "csv",
+        "checkpoints",
+        "model.safetensors",
+        "model.md",
+        "uncertainty.png",
+    ),
     "run.json",
 )
 _PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mixed")
@@ -279,8 +288,7 @@ def _with_callbacks(
     steps = asked if isinstance(asked, int) and asked else -1
     if isinstance(interval, int) and 0 < steps < interval:
         options["val_check_interval"] = interval = steps  # a short run is validated once, at its end
-    if options.get("logger") in (None, True):
-        options["logger"] = TensorBoardLogger(str(output), name="tensorboard", version="")
+    options["logger"] = _logger(options.get("logger"), output)
     folder = str(output / "checkpoints")
     monitor = f"val/{settings.monitor}"
     best = (
@@ -316,6 +324,15 @@ def _with_callbacks(
     options["callbacks"] = [*(callbacks if isinstance(callbacks, list) else [callbacks]), *extra]
     options.setdefault("default_root_dir", str(output))
     return options
+
+
+def _logger(asked: object, output: Path) -> object:
+    """What logs a run, by our names; a logger of Lightning's, given from code, as it is."""
+    if asked in (None, True, "tensorboard"):
+        return TensorBoardLogger(str(output), name="tensorboard", version="")
+    if asked == "csv":
+        return CSVLogger(str(output), name="csv", version="")
+    return False if asked == "none" else asked
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from lightdepth import plain_yaml
 from lightdepth.calibration.matrix import matrix_and_distortion, matrix_numbers
 from lightdepth.calibration.other_programs import other_program
 from lightdepth.calibration.plain_text import cannot_hold
@@ -20,11 +21,11 @@ from lightdepth.files.text import read_text
 from lightdepth.files.writing import write_whole
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(plain_yaml.Loader):
     """A safe loader that takes OpenCV's matrices for the mappings they are."""
 
 
-def _mapping(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+def _mapping(loader: plain_yaml.Loader, node: yaml.MappingNode) -> dict[Any, Any]:
     return loader.construct_mapping(node, deep=True)
 
 
@@ -64,8 +65,8 @@ def _fields(path: Path) -> dict[str, Any]:
     # OpenCV's first line, `%YAML:1.0`, is no YAML.
     text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
     try:
-        data = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        data = plain_yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
         raise InputError(path, f"not valid YAML ({' '.join(str(error).split())[:200]})", "correct it there") from error
     if not isinstance(data, dict):
         raise InputError(path, "no keys in it", "expected camera_matrix, distortion_coefficients and the image size")

@@ -26,10 +26,11 @@ from jsonargparse import (
     set_parsing_settings,
 )
 
+from lightdepth import plain_yaml
 from lightdepth.command_line.gone_settings import GONE_SETTINGS
 from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, literals, placeholder
 from lightdepth.command_line.pages import Page
-from lightdepth.command_line.settings_yaml import read_settings, use_words
+from lightdepth.command_line.settings_yaml import read_settings, take_plain_values, use_words
 
 HELP, HELP_ALL = ("-h", "--help"), ("--help-all", "--help_all")
 _WIDTH = 100
@@ -76,6 +77,7 @@ class Parser(ArgumentParser):
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         set_parsing_settings(docstring_parse_attribute_docstrings=True)
         use_words()
+        take_plain_values()
         super().__init__(*arguments, **{"formatter_class": Formatter, **settings})
         self.page = Page()
 
@@ -175,7 +177,7 @@ def parsed(parser: Parser, argv: Sequence[str]) -> Namespace:
         _check_config(parser, file)
     try:
         return parser.parse_args(spelled(parser, argv))
-    except argparse.ArgumentError as error:
+    except (argparse.ArgumentError, ImportError) as error:
         fail(parser, one_line(parser, argv, str(error)))
 
 
@@ -242,7 +244,7 @@ def listed(action: argparse.Action) -> tuple[Any, bool] | None:
 
 def _list_text(value: str, of: Any, nested: bool) -> str:
     try:
-        read = yaml.safe_load(value)
+        read = plain_yaml.load(value)
     except yaml.YAMLError:
         read = value
     if isinstance(read, Mapping) or read is None:
@@ -264,7 +266,9 @@ def _as_list(value: Any, of: Any, nested: bool) -> Any:
 def one_line(parser: Parser, argv: Sequence[str], message: str) -> str:
     """What is wrong with the words of a command line: what was typed, the nearest that there is, where to read on."""
     name = ""
-    if found := re.search(r"unrecognized arguments: (\S+)", message):
+    if found := re.search(r"Importing '(.+?)' is not allowed", message):
+        said = f"{found[1]}: settings take plain values, and name no code"
+    elif found := re.search(r"unrecognized arguments: (\S+)", message):
         said, name = _unknown(parser, found[1])
     elif found := re.search(r"Option '(.+?)' is not accepted|Group '(.+?)' does not accept option '(.+?)'", message):
         key = found[1] or f"{found[2]}.{found[3]}"
@@ -276,7 +280,7 @@ def one_line(parser: Parser, argv: Sequence[str], message: str) -> str:
     elif found := re.search(r"argument (\S+?): expected one argument", message):
         said = f"{dashed(found[1].split('/')[0])} needs a value"
     elif found := re.search(r"Problems parsing config: (.*)", message, re.DOTALL):
-        files = [path for path in config_files(argv) if not _is_yaml(path)]
+        files = [path for path in config_files(argv) if _not_yaml(path)]
         said = f"{files[0] if files else '--config'}: not YAML: {' '.join(found[1].split())}"
     else:
         said = " ".join(message.split())
@@ -353,8 +357,8 @@ def config_files(argv: Sequence[str]) -> Iterator[Path]:
 def _check_config(parser: Parser, file: Path) -> None:
     """Ends the program where a file is no YAML of settings, or has a value in the place of a group of them."""
     more = f"Read on: {parser.prog} --help"
-    if not _is_yaml(file):
-        fail(parser, f"{file}: not YAML: expected a line `option: value` for each setting, in UTF-8. {more}")
+    if why := _not_yaml(file):
+        fail(parser, f"{file}: not YAML: {why}; expected a line `option: value` for each setting, in UTF-8. {more}")
     found = read_settings(file)
     if not isinstance(found, Mapping):
         fail(parser, f"{file}: no settings in it; expected a line `option: value` for each. {more}")
@@ -364,19 +368,20 @@ def _check_config(parser: Parser, file: Path) -> None:
             fail(parser, f"{file}: {key} is {value!r}; expected settings below it, such as {below[key]}. {more}")
 
 
-def _is_yaml(path: Path) -> bool:
+def _not_yaml(path: Path) -> str:
+    """Why a file is no YAML of settings; nothing where it is."""
     try:
         read_settings(path)
-    except (yaml.YAMLError, UnicodeDecodeError):
-        return False
-    return True
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        return " ".join(str(error).split())[:200] or "no text"
+    return ""
 
 
 def _file_with(argv: Sequence[str], key: str) -> str:
     """`FILE: ` for the last file of settings on the command line that has the key, else nothing."""
     result = ""
     for path in config_files(argv):
-        node: Any = read_settings(path) if _is_yaml(path) else None
+        node: Any = None if _not_yaml(path) else read_settings(path)
         for part in key.split("."):
             node = node.get(part, _ABSENT) if isinstance(node, Mapping) else _ABSENT
         result = f"{path}: " if node is not _ABSENT else result

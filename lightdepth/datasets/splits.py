@@ -259,7 +259,20 @@ def _matches(key: str, names: str | list[str]) -> bool:
 
 
 def located(root: Path, name: str) -> Path | None:
-    """The folder of this name, or the one below the same folder whose name means the same sequence."""
+    """The folder of this name, or the one below the same folder whose name means the same sequence.
+
+    Raises InputError where a link leads out of `root`: a file that names what is read names nothing else."""
+    found = _located(root, name)
+    if found is not None and not found.resolve().is_relative_to(root.resolve()):
+        raise InputError(
+            found,
+            f"is a link that leads out of {root}, to {found.resolve()}",
+            "put the folder itself there",
+        )
+    return found
+
+
+def _located(root: Path, name: str) -> Path | None:
     if (root / name).is_dir():
         return root / name
     above = (root / name).parent

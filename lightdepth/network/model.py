@@ -31,6 +31,8 @@ Input = Literal["rgb", "closed_form", "ray_z", "mask", "reflectance"]
 Encoder = Literal["resnet18", "resnet34", "resnet50", "vitt14", "vits14", "vitb14", "vitl14"]
 KINDS = ("tiny", "unet", "dpt")
 ENCODERS = {"tiny": (), "unet": tuple(unet.ENCODERS), "dpt": tuple(dpt.ENCODERS)}
+MAX_WIDTH = 256
+"""Of the tiny network, which then has 130 million weights: a file that asks for more is no checkpoint of ours."""
 _DEFAULT_ENCODER = {"unet": "resnet18", "dpt": "vits14"}
 
 
@@ -68,6 +70,7 @@ class NetworkConfig:
     texture in it."""
 
     def __post_init__(self) -> None:
+        _check_plain(self)
         object.__setattr__(self, "inputs", tuple(self.inputs))  # JSON has lists
         unknown = [name for name in self.inputs if name not in CHANNELS]
         if unknown or not self.inputs:
@@ -85,8 +88,12 @@ class NetworkConfig:
         elif self.encoder not in ENCODERS[self.kind]:
             known = ", ".join(ENCODERS[self.kind]) or "none"
             raise InputError("network encoder", f"{self.encoder!r} of {self.kind} is not known", f"expected {known}")
-        if self.width < 1 or self.blur < 0:
-            raise InputError("network", f"width {self.width}, blur {self.blur}", "expected width > 0 and blur >= 0")
+        if not 1 <= self.width <= MAX_WIDTH or not 0 <= self.blur <= 1:
+            raise InputError(
+                "network",
+                f"width {self.width}, blur {self.blur}",
+                f"expected width > 0, at most {MAX_WIDTH}, and blur >= 0, at most 1",
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON and for checkpoints that load without pickle."""
@@ -99,8 +106,23 @@ class NetworkConfig:
             return cls(**values)
         except TypeError as error:
             raise InputError(
-                "network configuration", f"{values}: {error}", "was it written by another version of the program?"
+                "network configuration", f"{error}", "was it written by another version of the program?"
             ) from error
+
+
+def _check_plain(config: NetworkConfig) -> None:
+    """Raises InputError for values of another kind, as a file of anyone's may have them, before they are shown."""
+    words = ("kind", "output", "norm")
+    fits = all(isinstance(getattr(config, name), str) for name in words)
+    fits &= config.encoder is None or isinstance(config.encoder, str)
+    fits &= isinstance(config.inputs, (list, tuple)) and len(config.inputs) <= len(CHANNELS)
+    fits = fits and all(isinstance(name, str) for name in config.inputs)
+    fits &= isinstance(config.uncertainty, bool) and isinstance(config.width, int)
+    fits &= isinstance(config.blur, (int, float))
+    if not fits:
+        raise InputError(
+            "network configuration", "values of another kind", "was it written by another version of the program?"
+        )
 
 
 class Estimate(NamedTuple):

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from lightdepth.errors import InputError
 
-Settings = dict[str, Any]
+_Plain = bool | int | float | str | None
+Settings = dict[str, _Plain | list[_Plain | list[_Plain]] | dict[str, _Plain | list[_Plain]]]
 """Dotted options of `train` and their values, as a YAML gives them; the parser of `train` checks them."""
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
+from lightdepth.files.weights import check_header, read_pickled
 from lightdepth.frame import Frame, resized_mask
 
 _CELLS = 8
@@ -237,9 +238,6 @@ class LoftrMatcher:
 
 def read_loftr(settings: LoftrSettings) -> Any:
     """kornia's LoFTR with the weights of a local file. Raises InputError when there is none, or it is not LoFTR's."""
-    import pickle
-
-    import torch
     from kornia.feature import LoFTR
 
     path = settings.weights
@@ -254,14 +252,17 @@ def read_loftr(settings: LoftrSettings) -> Any:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
+            check_header(path, "use kornia's loftr_outdoor.ckpt")
             state: Any = load_file(path)
         else:
-            state = torch.load(path, map_location="cpu", weights_only=True)
+            state = read_pickled(path, "use kornia's loftr_outdoor.ckpt")
         state = state.get("state_dict", state)
         state = {name.removeprefix("matcher."): value for name, value in state.items()}
         network = LoFTR(pretrained=None)
         network.load_state_dict(state)
-    except (RuntimeError, OSError, ValueError, LookupError, EOFError, AttributeError, pickle.UnpicklingError) as error:
+    except InputError:
+        raise
+    except (RuntimeError, OSError, ValueError, LookupError, AttributeError) as error:
         raise InputError(
             path, f"not LoFTR's weights ({str(error).splitlines()[0][:200]})", "expected kornia's loftr_outdoor.ckpt"
         ) from error
