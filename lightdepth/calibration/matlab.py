@@ -15,6 +15,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, camera_from_params, camera_of, opencv_camera
 from lightdepth.errors import InputError
+from lightdepth.files.reading import MOST_TEXT, check_bytes, said
 
 _AS_STRUCTURE = "in MATLAB: s = toStruct(params); save('camera.mat', '-struct', 's', '-v7')"
 _EXPECTED = (
@@ -41,6 +42,8 @@ def read_matlab(path: Path) -> CameraModel:
 def _variables(path: Path) -> Variables:
     from scipy.io import loadmat
 
+    if path.is_file():
+        check_bytes(path.stat().st_size, MOST_TEXT, path, "calibration")
     try:
         variables: dict[str, Any] = loadmat(path, squeeze_me=True, struct_as_record=False)
     except NotImplementedError as error:
@@ -50,7 +53,7 @@ def _variables(path: Path) -> Variables:
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror or error})", "expected a MATLAB file") from error
     except Exception as error:  # whatever a broken file makes the reader stumble over
-        raise InputError(path, f"not a MATLAB file that can be read ({error})", "save it again") from error
+        raise InputError(path, f"not a MATLAB file that can be read ({said(error)})", "save it again") from error
     if any(type(value).__name__ == "MatlabOpaque" for value in variables.values()) or "None" in variables:
         raise InputError(path, "a MATLAB object, which only MATLAB can read", f"save a structure: {_AS_STRUCTURE}")
     return variables

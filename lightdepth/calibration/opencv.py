@@ -16,6 +16,7 @@ from lightdepth.calibration.plain_text import cannot_hold
 from lightdepth.calibration.xml_text import opencv_fields
 from lightdepth.camera import Brown, CameraModel, FullBrown, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
+from lightdepth.files.reading import reads
 from lightdepth.files.text import read_text
 from lightdepth.files.writing import write_whole
 
@@ -32,6 +33,7 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):  # the second is OpenCV 5's f
     _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _mapping)
 
 
+@reads("an OpenCV YAML")
 def read_opencv(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
     """The camera of a YAML, or of OpenCV's XML. Keys in any case; what is not about the camera is passed over. `size`
     (width, height) is that of the images, for files that hold none."""
@@ -44,6 +46,7 @@ def camera_of_keys(fields: dict[str, Any], path: Path, size: tuple[int, int] | N
     return matrix_and_distortion(fields, path, size) if other is None else other
 
 
+@reads("an OpenCV YAML")
 def read_matrices(path: Path, names: tuple[str, ...]) -> dict[str, list[float]]:
     """The numbers of named matrices in an OpenCV YAML, row by row: a stereo calibration's M1, D1, T."""
     fields = _fields(path)

@@ -28,6 +28,7 @@ from lightdepth.calibration.vicalib import read_photometric, read_vicalib, write
 from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.errors import InputError
 from lightdepth.files.colmap_cameras import read_cameras_binary
+from lightdepth.files.reading import reads
 from lightdepth.files.schema import read_json
 from lightdepth.files.text import read_text, rows
 from lightdepth.photometry import PhotometricCalibration
@@ -51,6 +52,7 @@ _WRITERS: dict[str, Callable[[CameraModel, Path], None]] = {
 _SUFFIXES = {".json": "json", ".xml": "vicalib", ".yaml": "opencv", ".yml": "opencv", ".txt": "colmap"}
 
 
+@reads("a camera calibration")
 def read_camera(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
     """The one camera of a calibration file, in our pixel convention.
 
@@ -148,6 +150,7 @@ def write_camera(camera: CameraModel, path: Path, format: str | None = None) -> 
     _WRITERS[format](camera, Path(path))
 
 
+@reads("a calibration of the light")
 def read_light(source: str | Path) -> PhotometricCalibration:
     """A light.json file, an EndoMapper photometric XML, or values written out as `gamma=2.2,mu=0`."""
     text, path = str(source), Path(source)

@@ -17,6 +17,7 @@ from lightdepth.datasets.sequence import FrameSequence, legible, list_images, no
 from lightdepth.datasets.video_sequence import check_turned, open_clip, read_video, video_at
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size
+from lightdepth.files.reading import reading
 from lightdepth.frame import check_image_size
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.which_frame import Stamps
@@ -47,7 +48,8 @@ def open_sequence(
     """
     path = Path(path)
     try:
-        return check_sequence(_open(path, format, camera, light, mask, map_camera, bit_depth))
+        with reading(path, "frames that can be read", "expected files that are there and may be read"):
+            return check_sequence(_open(path, format, camera, light, mask, map_camera, bit_depth))
     except InputError as error:
         cure = ""
         if path.is_dir() and not _is_cluster(path, format):
@@ -55,12 +57,6 @@ def open_sequence(
         if not cure:
             raise
         raise InputError(error.where, error.found, f"{error.cure}{cure}") from error
-    except OSError as error:
-        raise InputError(
-            error.filename or path,
-            f"cannot be read ({error.strerror or error})",
-            "expected files that are there and may be read",
-        ) from error
 
 
 def stamps_of(path: str | Path, format: str | None = None) -> Stamps:

@@ -26,6 +26,8 @@ def read_json(path: Path) -> Any:
         raise InputError(path, f"not UTF-8 (at byte {error.start})", "save it as UTF-8") from error
     except ValueError as error:
         raise InputError(path, f"not valid JSON ({error})", "correct it there") from error
+    except RecursionError as error:
+        raise InputError(path, "not valid JSON (brackets in one another without end)", "correct it there") from error
 
 
 def checked_fields(schema: type[_Schema], data: Any, where: str) -> _Schema:

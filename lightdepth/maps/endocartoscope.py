@@ -24,6 +24,7 @@ from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.colmap_cameras import read_cameras_text
+from lightdepth.files.reading import reads
 from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
 from lightdepth.files.text import is_comment, parse_numbers, text_lines
 from lightdepth.maps.checks import checked, guessed
@@ -61,6 +62,7 @@ def trajectory_path(tree: Path, map_id: int) -> Path:
     return Path(tree) / TRAJECTORIES / f"cam_traj_map_{map_id:03d}.txt"
 
 
+@reads("a trajectory")
 def read_trajectory(path: Path) -> list[TrajectoryPose]:
     """A cam_traj_map file -> poses in the file's order. Frames that were not localised (pose not finite) are left out.
 
