@@ -14,6 +14,7 @@ import numpy as np
 from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.errors import InputError
+from lightdepth.regular import regular
 
 _UNREADABLE = (OSError, EOFError, KeyError, ValueError, TypeError, AssertionError, zipfile.BadZipFile, zlib.error)
 
@@ -85,6 +86,7 @@ def shrunk(prediction: DepthPrediction, camera: CameraModel) -> DepthPrediction:
 
 def read_prediction(path: str | Path) -> DepthPrediction:
     """A prediction from its .npz. Raises InputError when it is not one."""
+    regular(path)
     try:
         with np.load(path, allow_pickle=False) as data:
             meta = json.loads(str(data["meta"]))

@@ -31,6 +31,7 @@ from lightdepth.files.headers import what_is_there
 from lightdepth.files.images import read_raw
 from lightdepth.geometry import distance_from_depth
 from lightdepth.prediction import DepthPrediction, read_prediction
+from lightdepth.regular import regular
 
 DepthKind = Literal["distance", "depth", "disparity"]
 SUFFIXES = ("npz", "npy", "exr", "tiff", "tif", "png")
@@ -166,6 +167,7 @@ def _array(path: Path, kind: DepthKind) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _load_npy(path: Path) -> np.ndarray:
+    regular(path)
     try:
         return np.asarray(np.load(path, allow_pickle=False))
     except _UNREADABLE as error:
@@ -173,6 +175,7 @@ def _load_npy(path: Path) -> np.ndarray:
 
 
 def _load_npz(path: Path) -> dict[str, np.ndarray]:
+    regular(path)
     try:
         with np.load(path, allow_pickle=False) as data:
             return {name: data[name] for name in data.files}

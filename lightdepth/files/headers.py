@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from lightdepth.errors import InputError
+from lightdepth.regular import irregular
 
 _ORIENTATION, _WIDTH, _HEIGHT, _BITS, _SUBFILE, _SAMPLE_FORMAT = 274, 256, 257, 258, 254, 339
 _EXTRA_SAMPLES = 338
@@ -62,9 +63,7 @@ def header_in(data: bytes) -> Header | None:
 
 def what_is_there(path: Path) -> str:
     """What stands at a path that is no file, for messages."""
-    if not path.exists():
-        return "no such image"
-    return "a folder, not a file" if path.is_dir() else "a named pipe or a device, not a file"
+    return f"{irregular(path)}, not a file" if path.exists() else "no such image"
 
 
 def as_stored(data: bytes) -> bytes:
