@@ -188,7 +188,7 @@ def test_depth_files_that_would_hang_or_take_all_memory_are_refused_at_once(data
     for folder in (pipes, huge):
         folder.mkdir()
     os.mkfifo(pipes / "0.exr")
-    assert "a named pipe or a device" in refusal(pipes)
+    assert "a named pipe" in refusal(pipes)
     with (huge / "0.npy").open("wb") as stream:
         shape = {"descr": "<f4", "fortran_order": False, "shape": (10**7, 10**7)}
         np.lib.format.write_array_header_1_0(stream, shape)

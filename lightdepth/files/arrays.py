@@ -15,6 +15,7 @@ import numpy as np
 
 from lightdepth.errors import InputError
 from lightdepth.files.reading import reading
+from lightdepth.regular import regular
 
 MOST_BYTES = 1 << 29
 """Bytes of one array, and of all of a file together: a picture of 8K has 265 MB as float64."""
@@ -40,6 +41,7 @@ def read_arrays(
     path: Path, what: str = "arrays", cure: str = "expected an .npz as numpy.savez writes it"
 ) -> dict[str, np.ndarray]:
     """The arrays of a .npz by name. Raises InputError before anything is unpacked where that would be too much."""
+    regular(path)
     with reading(path, what, cure), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         if len(members) > _MOST_MEMBERS:

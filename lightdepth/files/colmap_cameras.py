@@ -10,7 +10,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.errors import InputError
-from lightdepth.files.reading import reading, reads
+from lightdepth.files.reading import reading
 from lightdepth.files.text import numbered_lines, parse_integer, parse_numbers
 
 _BINARY_MODELS = {  # model number in cameras.bin -> name, number of parameters
@@ -35,9 +35,13 @@ _BINARY_MODELS = {  # model number in cameras.bin -> name, number of parameters
 }
 
 
-@reads("COLMAP's cameras")
 def read_cameras_text(path: Path) -> dict[int, CameraModel]:
     """Cameras by id, in the file's own pixel convention."""
+    with reading(path, "COLMAP's cameras"):
+        return _cameras_text(path)
+
+
+def _cameras_text(path: Path) -> dict[int, CameraModel]:
     expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
     cameras = {}
     for number, line in numbered_lines(path):
@@ -97,8 +101,13 @@ class BinaryFile:
         )
 
 
-@reads("COLMAP's cameras")
 def read_cameras_binary(path: Path) -> dict[int, CameraModel]:
+    """Cameras by id, in the file's own pixel convention."""
+    with reading(path, "COLMAP's cameras"):
+        return _cameras_binary(path)
+
+
+def _cameras_binary(path: Path) -> dict[int, CameraModel]:
     data, cameras = BinaryFile(path), {}
     for _ in range(data.take("Q")[0]):
         camera_id, model, width, height = data.take("IiQQ")

@@ -19,6 +19,7 @@ from PIL import Image
 
 from lightdepth.errors import InputError
 from lightdepth.files.reading import MOST_PIXELS
+from lightdepth.regular import irregular
 
 _ORIENTATION, _WIDTH, _HEIGHT, _BITS, _SUBFILE, _SAMPLE_FORMAT = 274, 256, 257, 258, 254, 339
 _EXTRA_SAMPLES = 338
@@ -63,9 +64,7 @@ def header_in(data: bytes, where: str = "a picture") -> Header | None:
 
 def what_is_there(path: Path) -> str:
     """What stands at a path that is no file, for messages."""
-    if not path.exists():
-        return "no such image"
-    return "a folder, not a file" if path.is_dir() else "a named pipe or a device, not a file"
+    return f"{irregular(path)}, not a file" if path.exists() else "no such image"
 
 
 def as_stored(data: bytes) -> bytes:

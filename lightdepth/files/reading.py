@@ -8,12 +8,10 @@ our own mistake; and a warning that was made an error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import wraps
 from pathlib import Path
 from types import TracebackType
-from typing import Concatenate, ParamSpec, TypeVar
 
 from lightdepth.errors import InputError
 
@@ -28,10 +26,6 @@ LONGEST_SIDE = 65535
 """Pixels of a picture's or a camera's side."""
 MOST_TEXT = 64 << 20
 """Bytes of a calibration or another small text: a thousand times what the longest that is known has."""
-
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
-_Path = TypeVar("_Path", bound=str | Path)
 
 
 @contextmanager
@@ -61,22 +55,6 @@ def reading(
         raise InputError(path, "its parts lie inside one another without end", cure) from error
     except Exception as error:  # whatever a broken file makes a parser stumble over
         raise InputError(path, f"not {what} ({said(error)})", cure) from error
-
-
-def reads(
-    what: str, cure: str = "copy it again, or leave it out"
-) -> Callable[[Callable[Concatenate[_Path, _P], _R]], Callable[Concatenate[_Path, _P], _R]]:
-    """A function whose first argument is the path that it reads, as `reading` has it."""
-
-    def around(read: Callable[Concatenate[_Path, _P], _R]) -> Callable[Concatenate[_Path, _P], _R]:
-        @wraps(read)
-        def guarded(path: _Path, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
-            with reading(path, what, cure):
-                return read(path, *args, **kwargs)
-
-        return guarded
-
-    return around
 
 
 def said(error: BaseException) -> str:

@@ -9,12 +9,13 @@ import numpy as np
 
 from lightdepth.errors import InputError
 from lightdepth.files.reading import MOST_TEXT, check_bytes
+from lightdepth.regular import regular
 
 
 def read_text(path: Path, expected: str) -> str:
     """The file's text; `expected` ends the message when it is something else."""
     try:
-        check_bytes(Path(path).stat().st_size, MOST_TEXT, path, "text")
+        check_bytes(regular(path, expected).stat().st_size, MOST_TEXT, path, "text")
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror or error})", expected) from error
@@ -46,7 +47,7 @@ def to_numbers(words: list[str], where: str, expected: str) -> list[float]:
 
 def text_lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8-sig").split("\n")
+        return regular(path).read_text(encoding="utf-8-sig").split("\n")
     except OSError as error:
         raise InputError(
             path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
