@@ -18,14 +18,13 @@ import random
 import re
 import resource
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -235,8 +234,9 @@ def keep(parser: Any, sample: Any, data: bytes) -> str:
 class Fuzzing:
     """Inputs of one parser, one after the other, in one folder. An input is the number of a sample and bytes."""
 
-    def __init__(self, parser: Any, folder: Path, seed: int):
+    def __init__(self, parser: Any, folder: Path, seed: int, keeping: bool = True):
         self.parser, self.folder, self.rng = parser, folder, random.Random(f"{parser.name} {seed}")
+        self.keeping = keeping
         self.found, self.known = Found(parser.name), set()  # type: ignore[var-annotated]
         self.samples = parser.samples()
         self.corpus = [(i, sample.content) for i, sample in enumerate(self.samples)] + kept(parser)
@@ -265,7 +265,8 @@ class Fuzzing:
         kind = re.sub(r"\d{3,}|0x\w+|'.*'", "", wrong.split(": ")[0])
         if wrong and kind not in self.known:
             self.known.add(kind)
-            self.found.findings[keep(self.parser, sample, data)] = wrong
+            name = keep(self.parser, sample, data) if self.keeping else f"input {self.found.inputs}"
+            self.found.findings[name] = wrong
         return refused
 
 
@@ -273,21 +274,11 @@ def _resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def child(name: str, seconds: float, seed: int, folder: Path) -> None:
+def child(parser: Any, seconds: float, seed: int, folder: Path, guided: Any) -> None:
     """One parser in this process, until the time is over. `folder/found.json` is kept up to date."""
-    guided = None
-    if os.environ.get("FUZZ_BLIND") != "1":
-        with suppress(ImportError):
-            import atheris as guided
-    if guided is not None:
-        with guided.instrument_imports(include=["lightdepth", "densify"]):
-            import strangers
-    else:
-        import strangers
-
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what libraries print of broken files
     os.dup2(1, 2)
-    fuzzing = Fuzzing(strangers.PARSERS[name], folder, seed)
+    fuzzing = Fuzzing(parser, folder, seed)
     fuzzing.again()
     status = Path("/proc/self/statm")
     if status.is_file():
@@ -334,25 +325,19 @@ def child(name: str, seconds: float, seed: int, folder: Path) -> None:
     guided.Fuzz()
 
 
-def run(name: str, seconds: float, seed: int) -> Found:
+def run(parser: Any, seconds: float, seed: int, guided: Any) -> Found:
     """One parser in processes of their own: one that dies or hangs is a finding, and another goes on."""
-    import strangers
-
-    parser, total, left = strangers.PARSERS[name], Found(name), seconds
+    total, left = Found(parser.name), seconds
+    parser.samples()
     while left > 1:
         with tempfile.TemporaryDirectory(prefix="fuzz-") as place:
             folder, began = Path(place), time.monotonic()
-            arguments = [name, "--child", place, "--seconds", str(left), "--seed", str(seed)]
-            process = subprocess.Popen([sys.executable, __file__, *arguments])
-            died = ""
-            try:
-                code = process.wait(left + 120)
-                died = "" if code == 0 else f"the process ended with {code}"
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                died = "it hung in a library"
-            found = Found(name)
+            process = os.fork()
+            if process == 0:
+                child(parser, left, seed, folder, guided)
+                os._exit(0)
+            died = _waited_for(process, folder)
+            found = Found(parser.name)
             if (folder / "found.json").is_file():
                 found = Found(**json.loads((folder / "found.json").read_text()))
             if died and (folder / "current").is_file():
@@ -367,24 +352,41 @@ def run(name: str, seconds: float, seed: int) -> Found:
     return total
 
 
+def _waited_for(process: int, folder: Path) -> str:
+    """How the process ended, "" where as it should. One whose input takes a minute is stuck in a library."""
+    began, current = time.monotonic(), folder / "current"
+    while True:
+        ended, status = os.waitpid(process, os.WNOHANG)
+        if ended:
+            return "" if status == 0 else f"the process ended with {os.waitstatus_to_exitcode(status)}"
+        since = max(began, current.stat().st_mtime - time.time() + time.monotonic() if current.is_file() else began)
+        if time.monotonic() - since > 60:
+            os.kill(process, signal.SIGKILL)
+            os.waitpid(process, 0)
+            return "it hung in a library"
+        time.sleep(0.2)
+
+
 def main() -> int:
     parse = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parse.add_argument("parsers", nargs="*", help="names of parsers; all of them where left out")
     parse.add_argument("--seconds", type=float, default=60, help="for each parser")
     parse.add_argument("--seed", type=int, default=0)
-    parse.add_argument("--child", type=Path, help=argparse.SUPPRESS)
+    parse.add_argument("--blind", action="store_true", help="without atheris, though it is installed")
     asked = parse.parse_args()
-    if asked.child is not None:
-        child(asked.parsers[0], asked.seconds, asked.seed, asked.child)
-        return 0
-    import strangers
+    guided: Any = None
+    if not asked.blind:
+        with suppress(ImportError):
+            import atheris as guided
+    with guided.instrument_imports(include=["lightdepth", "densify"]) if guided is not None else nullcontext():
+        import strangers
 
     unknown = set(asked.parsers) - set(strangers.PARSERS)
     if unknown:
         parse.error(f"no parser {', '.join(sorted(unknown))}; known are {', '.join(strangers.PARSERS)}")
     failed = False
     for name in asked.parsers or strangers.PARSERS:
-        found = run(name, asked.seconds, asked.seed)
+        found = run(strangers.PARSERS[name], asked.seconds, asked.seed, guided)
         failed |= bool(found.findings)
         share = f"{found.refused / max(found.inputs, 1):.0%} refused"
         print(
