@@ -154,7 +154,14 @@ def submap() -> Submap:
 # ---- calibrations
 
 
-@parser("camera in JSON", read_camera)
+def camera_used(path: Path, size: tuple[int, int] | None = None) -> object:
+    """A camera has to work where it was read: what a file says is checked when it is read, not when it is used."""
+    camera = read_camera(path, size)
+    with np.errstate(all="ignore"):
+        return camera.project(np.eye(3)), camera.unproject(np.array([[0.5, 0.5], [9.0, 7.0]])), camera.resized(32, 24)
+
+
+@parser("camera in JSON", camera_used)
 def _(folder: Path) -> list[str]:
     write_camera(FISHEYE, folder / "camera.json")
     names = ["camera.json"]
@@ -165,7 +172,7 @@ def _(folder: Path) -> list[str]:
     return names
 
 
-@parser("camera in YAML", lambda path: read_camera(path, (640, 480)))
+@parser("camera in YAML", lambda path: camera_used(path, (640, 480)))
 def _(folder: Path) -> list[str]:
     write_camera(FISHEYE, folder / "camera.yaml")
     names = ["camera.yaml"]
@@ -177,7 +184,7 @@ def _(folder: Path) -> list[str]:
     return names
 
 
-@parser("camera in XML", read_camera)
+@parser("camera in XML", camera_used)
 def _(folder: Path) -> list[str]:
     write_camera(FISHEYE, folder / "vicalib.xml")
     write_camera(SCARAMUZZA, folder / "ocam.xml")
@@ -191,7 +198,7 @@ def _(folder: Path) -> list[str]:
     return ["vicalib.xml", "ocam.xml", "opencv.xml"]
 
 
-@parser("camera in text", lambda path: read_camera(path, (96, 80)))
+@parser("camera in text", lambda path: camera_used(path, (96, 80)))
 def _(folder: Path) -> list[str]:
     write_camera(FISHEYE, folder / "cameras.txt")
     write_camera(SCARAMUZZA, folder / "calib_results.txt")
@@ -202,7 +209,7 @@ def _(folder: Path) -> list[str]:
     return sorted(p.name for p in folder.iterdir())
 
 
-@parser("camera of MATLAB", read_camera)
+@parser("camera of MATLAB", camera_used)
 def _(folder: Path) -> list[str]:
     bouguet = {"fc": [50.0, 50.0], "cc": [47.0, 39.0], "kc": [-0.1, 0, 0, 0, 0], "nx": 96.0, "ny": 80.0, "alpha_c": 0.0}
     savemat(folder / "Calib_Results.mat", bouguet)

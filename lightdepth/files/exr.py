@@ -67,10 +67,10 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
         return _channels(data, head)
     except InputError:
         raise
-    except (struct.error, IndexError, KeyError, UnicodeDecodeError, zlib.error, MemoryError) as error:
-        raise InputError(path, "a broken EXR file (cut off, or changed)", "copy it again, or leave it out") from error
     except ValueError as error:
         raise InputError(path, f"a broken EXR file ({error})", "copy it again, or leave it out") from error
+    except Exception as error:  # whatever its offsets and lengths lead to
+        raise InputError(path, "a broken EXR file (cut off, or changed)", "copy it again, or leave it out") from error
 
 
 @dataclass(frozen=True)
