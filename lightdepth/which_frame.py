@@ -64,7 +64,8 @@ class WhichFrame:
             raise InputError(
                 name or "''", "no number in the name", "frames are matched with map entries by the integer in it"
             )
-        if len(digits[-1].lstrip("0")) > 18 and int(digits[-1][-5000:]) >= 2**63:
+        significant = digits[-1].lstrip("0")
+        if len(significant) > 18 and (len(significant) > 19 or int(significant) >= 2**63):
             found = f"a number of {len(digits[-1])} digits in the name"
             raise InputError(name if len(name) <= 80 else f"{name[:80]}...", found, "expected one below 2^63")
         unit = _UNITS.get(len(digits[-1])) if digits[-1][0] in "12" else None

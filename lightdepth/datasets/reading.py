@@ -47,16 +47,16 @@ def open_sequence(
     `check_sequence` says what is doubtful.
     """
     path = Path(path)
-    try:
-        with reading(path, "frames that can be read", "expected files that are there and may be read"):
+    with reading(path, "frames that can be read", "expected files that are there and may be read"):
+        try:
             return check_sequence(_open(path, format, camera, light, mask, map_camera, bit_depth))
-    except InputError as error:
-        cure = ""
-        if path.is_dir() and not _is_cluster(path, format):
-            cure = _other_format(path, format) if format is not None else _folders_below(path)
-        if not cure:
-            raise
-        raise InputError(error.where, error.found, f"{error.cure}{cure}") from error
+        except InputError as error:
+            cure = ""
+            if path.is_dir() and not _is_cluster(path, format):
+                cure = _other_format(path, format) if format is not None else _folders_below(path)
+            if not cure:
+                raise
+            raise InputError(error.where, error.found, f"{error.cure}{cure}") from error
 
 
 def stamps_of(path: str | Path, format: str | None = None) -> Stamps:
