@@ -19,6 +19,7 @@ from lightdepth.brief import Brief
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
+from lightdepth.files.meshes import load_mesh
 from lightdepth.files.schema import read_json
 from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.sparse_map import Keyframe, Submap
@@ -293,9 +294,4 @@ def read_dense_map(folder: str | Path) -> DenseMapFiles:
 
 
 def _read_ply(path: Path) -> Any:
-    import trimesh
-
-    try:
-        return trimesh.load(path, process=False)
-    except (ValueError, KeyError, IndexError, OSError) as error:
-        raise InputError(path, f"damaged, or not a PLY file ({error})", "copy it again") from error
+    return load_mesh(path, "a PLY file, or it is damaged", "copy it again")

@@ -17,6 +17,7 @@ from densify.inputs import fitted_to_frames
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.below import given
+from lightdepth.files.meshes import load_mesh
 from lightdepth.geometry import depth_from_distance
 from lightdepth.maps import read_map
 from lightdepth.maps.endocartoscope import TrajectoryPose, read_trajectory, trajectory_path
@@ -187,9 +188,7 @@ def _without_observations(folder: Path, dense: DenseMapFiles) -> Submap:
 
 def _looks(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Colours (n, 3) uint8 and unit normals (n, 3) of a mesh file's vertices."""
-    import trimesh
-
-    mesh: Any = trimesh.load(path, process=False)
+    mesh: Any = load_mesh(path)
     colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(np.uint8)
     assert len(colors) == count, (len(colors), count)
     return colors, np.asarray(mesh.vertex_normals, float)

@@ -17,6 +17,7 @@ from lightdepth.calibration.plain_text import cannot_hold
 from lightdepth.calibration.xml_text import opencv_fields
 from lightdepth.camera import Brown, CameraModel, FullBrown, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
+from lightdepth.files.reading import reading
 from lightdepth.files.text import read_text
 from lightdepth.files.writing import write_whole
 
@@ -36,7 +37,8 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):  # the second is OpenCV 5's f
 def read_opencv(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
     """The camera of a YAML, or of OpenCV's XML. Keys in any case; what is not about the camera is passed over. `size`
     (width, height) is that of the images, for files that hold none."""
-    return camera_of_keys(_fields(path), path, size)
+    with reading(path, "a calibration in YAML or XML"):
+        return camera_of_keys(_fields(path), path, size)
 
 
 def camera_of_keys(fields: dict[str, Any], path: Path, size: tuple[int, int] | None = None) -> CameraModel:
@@ -47,6 +49,11 @@ def camera_of_keys(fields: dict[str, Any], path: Path, size: tuple[int, int] | N
 
 def read_matrices(path: Path, names: tuple[str, ...]) -> dict[str, list[float]]:
     """The numbers of named matrices in an OpenCV YAML, row by row: a stereo calibration's M1, D1, T."""
+    with reading(path, "a calibration in YAML or XML"):
+        return _matrices(path, names)
+
+
+def _matrices(path: Path, names: tuple[str, ...]) -> dict[str, list[float]]:
     fields = _fields(path)
     missing = [name for name in names if fields.get(name.lower()) is None]
     if missing:

@@ -31,6 +31,7 @@ from lightdepth.command_line.gone_settings import GONE_SETTINGS
 from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, literals, placeholder
 from lightdepth.command_line.pages import Page
 from lightdepth.command_line.settings_yaml import read_settings, take_plain_values, use_words
+from lightdepth.regular import regular
 
 HELP, HELP_ALL = ("-h", "--help"), ("--help-all", "--help_all")
 _WIDTH = 100
@@ -352,6 +353,8 @@ def config_files(argv: Sequence[str]) -> Iterator[Path]:
         path = following if word == "--config" else word.removeprefix("--config=") if word[:9] == "--config=" else ""
         if path and "\n" not in path and Path(path).is_file():  # settings may stand there themselves (gone_settings)
             yield Path(path)
+        elif path and "\n" not in path:
+            regular(path, "expected a YAML file of settings")
 
 
 def _check_config(parser: Parser, file: Path) -> None:

@@ -25,6 +25,7 @@ from lightdepth.camera import CameraModel
 from lightdepth.datasets.reading import FORMATS
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields
+from lightdepth.regular import regular
 
 _Schema = TypeVar("_Schema", bound=BaseModel)
 
@@ -79,6 +80,7 @@ def read_dataset_yaml(path: Path) -> DatasetInfo:
 
 def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     """A YAML file of ours, read by a safe loader; InputError names the file, and the field or the line."""
+    regular(path)
     try:
         data = plain_yaml.read(path, _Loader)
     except OSError as error:

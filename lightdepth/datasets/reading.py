@@ -18,6 +18,7 @@ from lightdepth.datasets.video_sequence import check_turned, open_clip, read_vid
 from lightdepth.errors import InputError
 from lightdepth.files.below import folders_in
 from lightdepth.files.images import image_size
+from lightdepth.files.reading import reading
 from lightdepth.frame import check_image_size
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.which_frame import Stamps
@@ -47,21 +48,16 @@ def open_sequence(
     `check_sequence` says what is doubtful.
     """
     path = Path(path)
-    try:
-        return check_sequence(_open(path, format, camera, light, mask, map_camera, bit_depth))
-    except InputError as error:
-        cure = ""
-        if path.is_dir() and not _is_cluster(path, format):
-            cure = _other_format(path, format) if format is not None else _folders_below(path)
-        if not cure:
-            raise
-        raise InputError(error.where, error.found, f"{error.cure}{cure}") from error
-    except OSError as error:
-        raise InputError(
-            error.filename or path,
-            f"cannot be read ({error.strerror or error})",
-            "expected files that are there and may be read",
-        ) from error
+    with reading(path, "frames that can be read", "expected files that are there and may be read"):
+        try:
+            return check_sequence(_open(path, format, camera, light, mask, map_camera, bit_depth))
+        except InputError as error:
+            cure = ""
+            if path.is_dir() and not _is_cluster(path, format):
+                cure = _other_format(path, format) if format is not None else _folders_below(path)
+            if not cure:
+                raise
+            raise InputError(error.where, error.found, f"{error.cure}{cure}") from error
 
 
 def stamps_of(path: str | Path, format: str | None = None) -> Stamps:

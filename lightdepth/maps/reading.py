@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lightdepth.errors import InputError
 from lightdepth.files.below import folders_in, given
+from lightdepth.files.reading import reading
 from lightdepth.maps.colmap import holds_model, read_submap
 from lightdepth.maps.convention import COLMAP, EXPORTER, Reader
 from lightdepth.maps.endocartoscope import MAPS, read_exported_submap
@@ -41,14 +42,8 @@ def read_map(path: Path | str, reader: Reader = Reader()) -> SparseMap:
     Raises InputError saying what was found, where, and what would be right.
     """
     path = Path(path)
-    try:
+    with reading(path, "a map", _ACCEPTED):
         return _read_map(path, reader)
-    except OSError as error:
-        raise InputError(
-            error.filename or path,
-            f"cannot be read ({error.strerror or error})",
-            "expected files that are there and may be read",
-        ) from error
 
 
 def _read_map(path: Path, reader: Reader) -> SparseMap:

@@ -16,6 +16,7 @@ from lightdepth.command_line.gone_settings import without_given
 from lightdepth.command_line.presets import shipped
 from lightdepth.command_line.settings_yaml import read_settings
 from lightdepth.errors import InputError
+from lightdepth.regular import regular
 from lightdepth.reporting.run import plain
 
 from ..colons import TubeData, colon_seeds
@@ -115,6 +116,7 @@ def plans_of(
 
 
 def _read(path: Path) -> dict[str, Any]:
+    regular(path, "expected a YAML like configs/train/*.yaml")
     try:
         values = read_settings(path)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
