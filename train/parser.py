@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from lightdepth.command_line.pages import PAGES
+from lightdepth.ranges import SEED
 
-from .trainer_options import TRAINER_OPTIONS, WITHOUT
+from .trainer_options import TRAINER_OPTIONS, TRAINER_RANGES, WITHOUT
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -37,6 +38,7 @@ def training_parser() -> Parser:
 
     from lightdepth.command_line.parsing import Parser, finish
     from lightdepth.command_line.presets import preset_help
+    from lightdepth.command_line.ranges import below, ranges_in
     from lightdepth.module import LightDepth
 
     from .datamodule import FrameData
@@ -62,7 +64,10 @@ def training_parser() -> Parser:
     assert parser.groups is not None
     parser.groups["model"].title = "How the network learns, and from which weights"
     parser.groups["trainer"].title = "Lightning's Trainer: device, length of the run, and what is logged"
-    finish(parser, PAGES["train"])
+    ranges = TRAINER_RANGES | {"seed": SEED}
+    for group, made in (("model", LightDepth), ("data", FrameData), ("fit", FitConfig)):
+        ranges |= below(group, ranges_in(made))
+    finish(parser, PAGES["train"], ranges)
     return parser
 
 

@@ -8,6 +8,7 @@ import os
 from collections.abc import Mapping
 
 from lightdepth.errors import InputError
+from lightdepth.ranges import above, at_least
 
 WITHOUT = {
     "default_root_dir",  # the run's folder
@@ -90,6 +91,28 @@ _SENTENCES = {
     "reload_dataloaders_every_n_epochs": "Number of epochs (passes over the training frames) after which what reads "
     "the frames is started anew; 0 for never. The frames stay the same. More do it less often.",
 }
+_RANGES = {
+    "num_nodes": at_least(1, up_to=100_000),
+    "devices": at_least(-1, up_to=100_000),
+    "fast_dev_run": at_least(0),
+    "max_epochs": at_least(-1),
+    "min_epochs": at_least(0),
+    "max_steps": at_least(-1),
+    "min_steps": at_least(0),
+    "max_time": at_least(0),
+    "limit_train_batches": above(0),
+    "limit_val_batches": above(0),
+    "overfit_batches": at_least(0),
+    "val_check_interval": above(0),
+    "check_val_every_n_epoch": at_least(1),
+    "num_sanity_val_steps": at_least(-1),
+    "log_every_n_steps": at_least(0),
+    "accumulate_grad_batches": at_least(1),
+    "gradient_clip_val": at_least(0),
+    "reload_dataloaders_every_n_epochs": at_least(0),
+}
+"""Of those that are numbers; `check_trainer_options` knows more of some."""
+TRAINER_RANGES = {f"trainer.{name}": numbers for name, numbers in _RANGES.items()}
 TRAINER_OPTIONS = {f"trainer.{name}": sentence for name, sentence in _SENTENCES.items()}
 
 

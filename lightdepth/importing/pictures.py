@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from lightdepth.importing.regions import Regions
 from lightdepth.importing.scan import Scan
 from lightdepth.importing.selection import BLURRED, DOUBLE, FROZEN, KEPT
 from lightdepth.importing.source import Source
+from lightdepth.ranges import PIXELS, checked
 from lightdepth.reporting.figures import thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run
@@ -30,10 +31,11 @@ _EXAMPLES = 8
 
 
 @dataclass(frozen=True)
+@checked
 class PictureConfig:
     """How pictures are cut, resized and freed of interlacing."""
 
-    size: tuple[int, int] | None = None
+    size: Annotated[tuple[int, int] | None, PIXELS] = None
     """Width and height to resize the frames to, pixels, after --crop, the camera with them; left out, they keep theirs.
     A larger one keeps finer detail, up to the frames' own size; other proportions than theirs stretch the picture."""
     crop: Literal["none", "auto"] = "none"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from lightdepth.errors import InputError
+from lightdepth.ranges import COUNT, SEED, checked
 
 Settings = dict[str, Any]
 """Dotted options of `train` and their values, as a YAML gives them; the parser of `train` checks them."""
@@ -44,6 +45,7 @@ class Row:
 
 
 @dataclass(frozen=True)
+@checked
 class JudgedColons:
     """Colons to judge on, with the lenses and the light's ranges of the training colons."""
 
@@ -54,11 +56,11 @@ class JudgedColons:
     (lightdepth.tube.variant)."""
     strength: Literal["weak", "strong"]
     """Strength of the light from wall to wall: weak or strong."""
-    first: int
+    first: Annotated[int, SEED]
     """Number that seeds the first colon; the others count on from it. Another one draws other colons."""
-    count: int
+    count: Annotated[int, COUNT]
     """Number of colons to judge on. More judge more surely and take longer."""
-    frames: int = 2
+    frames: Annotated[int, COUNT] = 2
     """Number of frames of each colon. More judge more surely and take longer."""
 
     def __post_init__(self) -> None:

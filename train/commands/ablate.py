@@ -13,8 +13,10 @@ from __future__ import annotations
 import shutil
 import time
 from pathlib import Path
+from typing import Annotated
 
 from lightdepth.errors import PartialFailure
+from lightdepth.ranges import SEED
 from lightdepth.reporting.run import recorded, write_run_json
 
 from ..ablation.judge import Judge
@@ -34,7 +36,7 @@ def ablate(
     settings: Settings | None = None,
     rows: tuple[Row, ...] = (),
     judged: tuple[JudgedColons, ...] = (),
-    seeds: tuple[int, ...] = (0, 1, 2),
+    seeds: Annotated[tuple[int, ...], SEED] = (0, 1, 2),
     table: Path | None = None,
     overwrite: bool = False,
 ) -> None:
