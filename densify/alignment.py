@@ -76,8 +76,6 @@ class AlignmentConfig:
                 f"{self.estimator!r} is not known",
                 f"expected one of {', '.join(get_args(Estimator))}",
             )
-        if not self.t > 0:
-            raise InputError("alignment.t", f"{self.t}", "expected a positive number of sigmas, such as 2.5")
 
 
 @dataclass(frozen=True, repr=False)

@@ -19,7 +19,6 @@ from typing import Annotated
 import numpy as np
 
 from lightdepth.brief import Brief
-from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
 from lightdepth.ranges import above, at_least, checked
 
@@ -42,16 +41,6 @@ class BendingConfig:
     bump_deviation: Annotated[float, above(0)] = 0.1
     """Expected size (standard deviation) of each bump of the bend, in log distance (0.1 is 10 %), above 0. A larger one
     lets depth bend more strongly."""
-
-    def __post_init__(self) -> None:
-        if any(n < 2 for n in self.grids):
-            raise InputError("bending.grids", f"{list(self.grids)}", "expected at least 2 bumps across and down")
-        if self.slope_deviation < 0 or not self.bump_deviation > 0:
-            raise InputError(
-                "bending",
-                f"slope_deviation {self.slope_deviation}, bump_deviation {self.bump_deviation}",
-                "expected at least 0 (no slope) and above 0",
-            )
 
     @property
     def precision(self) -> np.ndarray:

@@ -28,7 +28,7 @@ from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged
 from densify.evaluation.suite import Suite, present, read_suite
 from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.evaluation.truth import check_truth, read_truth
-from densify.inputs import MapSource, check_unit, map_and_frames
+from densify.inputs import MapSource, map_and_frames
 from densify.judging.withheld import WithheldOfMap, withheld_errors
 from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
@@ -43,6 +43,7 @@ from lightdepth.sparse_map import SparseMap
 
 
 @dataclass(frozen=True)
+@checked
 class TruthSource:
     """What is judged against, and how it is read."""
 
@@ -94,9 +95,8 @@ class JudgingConfig(MapReading):
     """Go on with a map whose frames, by their images, are others than those that it was made of, and only warn."""
 
     def __post_init__(self) -> None:
-        check_unit(self.mm_per_unit)
-        if not self.thresholds_mm or not all(t > 0 for t in self.thresholds_mm):
-            raise InputError("--thresholds-mm", f"{list(self.thresholds_mm)}", "expected positive distances in mm")
+        if not self.thresholds_mm:
+            raise InputError("--thresholds-mm", f"{list(self.thresholds_mm)}", "expected distances in mm")
 
 
 @dataclass(frozen=True)

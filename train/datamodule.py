@@ -103,18 +103,8 @@ class FrameData:
     """Number that draws colons, order and augmentation. Another one makes another run."""
 
     def __post_init__(self) -> None:
-        if self.random_reflectance is not None:
-            low, high = self.random_reflectance
-            if not 0 <= low <= high < 1:
-                raise InputError(
-                    "data", f"random_reflectance {self.random_reflectance}", "expected 0 <= low <= high < 1"
-                )
-        if not 0 < self.held_out < 1:
-            raise InputError("data", f"held_out {self.held_out}", "expected a share above 0 and below 1")
         if self.halves and self.batch_size < 2:
             raise InputError("data", "halves of a batch of one", "expected a batch_size of at least 2")
-        if min(*self.size, self.batch_size) < 1:
-            raise InputError("data", f"size {self.size}, batch_size {self.batch_size}", "expected positive numbers")
         if self.split is not None and (self.sequences or self.val_sequences):
             raise InputError("data", "a split and sequences", "give --data.split FILE or --data.sequences, not both")
         if (self.split is None) != (self.root is None):

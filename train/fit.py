@@ -75,10 +75,6 @@ class FitConfig:
     """When a run that goes nowhere is stopped."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.ema < 1 or self.patience < 0:
-            raise InputError(
-                "fit", f"ema {self.ema}, patience {self.patience}", "expected 0 <= ema < 1 and patience >= 0"
-            )
         if self.patience and self.monitor == "last":
             raise InputError(
                 "fit", "patience without a criterion", "set fit.monitor to loss, photometric or inconsistency"

@@ -62,14 +62,12 @@ class EstimatorsConfig:
     """Number that draws the keyframes and their points. Another one draws others."""
 
     def __post_init__(self) -> None:
-        if not self.shares or not all(0 <= share < 1 for share in self.shares):
+        if not self.shares:
             raise InputError("shares", f"{list(self.shares)}", "expected shares of at least 0 and below 1")
         if not self.kinds or set(self.kinds) - set(get_args(Kind)):
             raise InputError("kinds", f"{list(self.kinds)}", f"expected some of {', '.join(get_args(Kind))}")
-        if not self.points or min(self.points) < 8:
+        if not self.points:
             raise InputError("points", f"{list(self.points)}", "expected numbers of at least 8")
-        if self.draws < 1:
-            raise InputError("draws", f"{self.draws}", "expected at least 1")
 
 
 @dataclass(frozen=True)

@@ -71,12 +71,6 @@ class BenchConfig:
             given = getattr(self, name)
             if (not given and name != "cases") or len(set(given)) < len(given):
                 raise InputError(name, f"{list(given)}", "expected at least one, and none twice")
-        if not all(0 <= share < 1 for share in (*self.wrong_shares, self.screening_share)):
-            raise InputError("wrong_shares", f"{list(self.wrong_shares)}", "expected shares of at least 0 and below 1")
-        if min(self.image_size) < 32:
-            raise InputError("image_size", f"{list(self.image_size)}", "expected at least 32 pixels each way")
-        if self.first_seed < 0:
-            raise InputError("first_seed", f"{self.first_seed}", "expected 0 or more")
 
     def shares(self, scene: Scene) -> tuple[float, ...]:
         return self.wrong_shares if scene.maps == 1 else (self.screening_share,)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from lightdepth.errors import InputError
 from lightdepth.parallax import ParallaxConfig
 from lightdepth.ranges import SEED, at_least, checked
 
@@ -26,7 +25,3 @@ class JudgeConfig:
     it which bends are undone."""
     parallax: ParallaxConfig = field(default_factory=ParallaxConfig)
     """how distances are measured between the images of keyframes (--judge.parallax.on false leaves them out)"""
-
-    def __post_init__(self) -> None:
-        if self.folds < 2:
-            raise InputError("judge.folds", f"{self.folds}", "expected at least 2 parts, such as 5")

@@ -51,12 +51,6 @@ class ColonConfig:
     """Where frames are rendered: cpu, cuda (a GPU; needs the extra gpu), or auto, the GPU where there is one and that
     extra is installed."""
 
-    def __post_init__(self) -> None:
-        if self.frames < 1:
-            raise InputError("--frames", f"{self.frames}", "expected at least 1")
-        if min(self.size) < 1:
-            raise InputError("--size", f"{list(self.size)}", "expected a width and a height of some pixels")
-
     def rendered(
         self, scene: TubeConfig, breathing: BreathingConfig, progress: Callable[[int, int], None]
     ) -> TubeSequence:

@@ -11,7 +11,6 @@ import numpy as np
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.folder import write_times
-from lightdepth.errors import InputError
 from lightdepth.files.images import write_image
 from lightdepth.image_quality import eight_bits, one_field
 from lightdepth.importing.page import Picture
@@ -44,10 +43,6 @@ class PictureConfig:
     deinterlace: bool = False
     """Keep the even rows of each frame and interpolate the odd ones, for interlaced video, where moving edges look like
     combs; switched off, frames stay as they are."""
-
-    def __post_init__(self) -> None:
-        if self.size is not None and min(self.size) < 1:
-            raise InputError("--size", f"{self.size}", "expected a positive width and height")
 
 
 @dataclass(frozen=True)

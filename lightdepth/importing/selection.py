@@ -47,14 +47,6 @@ class Choice:
             raise InputError(
                 "--rate, --every", f"{self.rate} and {self.every}, which are both given", "give one of them"
             )
-        if self.rate is not None and not self.rate > 0:
-            raise InputError("--rate", f"{self.rate}", "expected frames per second above 0")
-        if self.every is not None and self.every < 1:
-            raise InputError("--every", f"{self.every}", "expected 1 or more")
-        if not 0 <= self.blur < 1:
-            raise InputError("--blur", f"{self.blur}", "expected a share of at least 0 and below 1")
-        if self.max_frames is not None and self.max_frames < 1:
-            raise InputError("--max-frames", f"{self.max_frames}", "expected 1 or more")
 
 
 def selected(times: np.ndarray, measures: Measures, choice: Choice) -> np.ndarray:

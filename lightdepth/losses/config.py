@@ -95,15 +95,6 @@ class LossConfig:
         for what, value, allowed in (("space", self.space, SPACES), ("gain", self.gain, GAINS)):
             if value not in allowed:
                 raise InputError(f"loss {what}", f"{value!r} is not known", f"expected one of {', '.join(allowed)}")
-        negative = [
-            name for name in (*TERMS, "self_supervised", "supervised", "uncertainty") if getattr(self, name) < 0
-        ]
-        if negative or self.huber < 0:
-            raise InputError(f"loss {', '.join(negative) or 'huber'}", "below 0", "expected weights of at least 0")
-        if self.ambient < 0 or not 0.2 <= self.shoulder <= 1:
-            raise InputError(
-                "loss", f"ambient {self.ambient}, shoulder {self.shoulder}", "expected at least 0, and .2 to 1"
-            )
 
 
 TERMS = ("photometric", "ssim", "saturated", "specular", "facing", "smoothness", "chroma", "albedo")

@@ -13,7 +13,6 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial import cKDTree
 
-from lightdepth.errors import InputError
 from lightdepth.ranges import Range, above, at_least, checked
 from lightdepth.tube.shape import TubeShape, wall_normals
 
@@ -32,16 +31,6 @@ class BreathingConfig:
     wavelength_mm: Annotated[float, at_least(0)] = 0.0
     """Distance from one wave to the next along the colon (peristalsis), mm; 0 lets the whole colon widen and narrow at
     once. A larger one makes longer waves; without an amplitude there are none."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.amplitude <= 0.3:
-            raise InputError("breathing.amplitude", f"{self.amplitude}", "expected a share from 0 to 0.3")
-        if not self.period > 0 or not 0 <= self.wavelength_mm < np.inf:
-            raise InputError(
-                "breathing",
-                f"period {self.period}, wavelength_mm {self.wavelength_mm}",
-                "expected a period above 0 and a wavelength of at least 0",
-            )
 
 
 class Breathing:

@@ -24,7 +24,6 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from lightdepth.errors import InputError
 from lightdepth.ranges import SHARE, Range, at_least, checked
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap, typical_distance
 
@@ -67,21 +66,6 @@ class MapErrors:
     points_follow: bool = False
     """Whether points move along with the keyframes that saw them when these drift (pose_drift, pose_drift_deg), as in a
     real SLAM; switched off, they stay where they are, and the poses contradict them."""
-
-    def __post_init__(self) -> None:
-        for name in ("drift", "side_factor"):
-            if not 0.1 <= getattr(self, name) <= 10:
-                raise InputError(name, f"{getattr(self, name)}", "expected a factor from 0.1 to 10")
-        for name in ("side_share", "fold_share", "loop_share", "loop_shift"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(name, f"{getattr(self, name)}", "expected a share from 0 to 1")
-        for name in ("pose_drift", "pose_drift_deg"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(name, f"{getattr(self, name)}", "expected 0 or more")
-        if self.loop_at is not None and not 0 <= self.loop_at <= 1:
-            raise InputError("loop_at", f"{self.loop_at}", "expected a share from 0 to 1")
-        if not np.isfinite(self.fold_shift):
-            raise InputError("fold_shift", f"{self.fold_shift}", "expected a finite number")
 
 
 @overload

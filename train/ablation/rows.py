@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from lightdepth.errors import InputError
 from lightdepth.ranges import COUNT, SEED, checked
 
 Settings = dict[str, Any]
@@ -15,6 +14,7 @@ Settings = dict[str, Any]
 
 
 @dataclass(frozen=True)
+@checked
 class Row:
     """One training."""
 
@@ -33,7 +33,7 @@ class Row:
     """What a network that has the wall's reflectance as an input is told of it when it is judged: the "true" value, a
     "wrong" one (0.3 more), or one "estimated" per colon without truth (least loss). Each makes one line of the
     table."""
-    seeds: tuple[int, ...] | None = None
+    seeds: Annotated[tuple[int, ...] | None, SEED] = None
     """Seeds of the row's own trainings, numbers; left out, those of the ablation. More make the row more certain and
     take longer."""
     curve: bool = False
@@ -62,14 +62,6 @@ class JudgedColons:
     """Number of colons to judge on. More judge more surely and take longer."""
     frames: Annotated[int, COUNT] = 2
     """Number of frames of each colon. More judge more surely and take longer."""
-
-    def __post_init__(self) -> None:
-        if min(self.count, self.frames) < 1 or self.first < 0:
-            raise InputError(
-                f"judged colons {self.name!r}",
-                f"count {self.count}, frames {self.frames}, first {self.first}",
-                "expected count and frames above 0 and first of at least 0",
-            )
 
     @property
     def seeds(self) -> range:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from lightdepth.errors import InputError
 from lightdepth.ranges import BETWEEN, SEED, above, at_least, checked
 
 from .module import What
@@ -64,19 +63,6 @@ class AdaptConfig:
     seed: Annotated[int, SEED] = 0
     """Number that all chance follows from: order of frames, augmentation, replayed colons, blocks of wall that judge,
     the beginning of low_rank. Another one makes another run, better or worse by chance alone."""
-
-    def __post_init__(self) -> None:
-        if min(self.steps, self.batch_size) < 1 or not self.learning_rate > 0 or self.replay < 0:
-            raise InputError(
-                "--steps",
-                f"{self.steps}, --batch-size {self.batch_size}, --learning-rate {self.learning_rate}, --replay "
-                f"{self.replay}",
-                "expected positive numbers, and 0 or more colons",
-            )
-        if not ((self.points is None or self.points >= 0) and self.overlap >= 0):
-            raise InputError("--points", f"{self.points}, --overlap {self.overlap}", "expected weights of 0 or more")
-        if not 0 < self.held_out < 1:
-            raise InputError("--held-out", f"{self.held_out}", "expected a share above 0 and below 1")
 
     def taught_by(self, has_map: bool) -> float:
         """The weight of a map's points, by whether there is a map."""

@@ -24,7 +24,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.writing import Content, write_together
 from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
-from lightdepth.ranges import Range
+from lightdepth.ranges import Range, checked
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.report import Report
@@ -46,6 +46,7 @@ _SHOWN = 48  # pictures of kept and of rejected frames each
 
 
 @dataclass(frozen=True)
+@checked
 class SelectConfig:
     """What is covisible and what is kept, by each way of telling."""
 

@@ -67,12 +67,6 @@ class NodeRules:
     to count, it has no effect."""
 
     def __post_init__(self) -> None:
-        if min(self.min_views, self.min_frames, self.max_views) < 1 or min(self.min_matches, self.max_skipped) < 0:
-            raise InputError(
-                "the rules of covisibility",
-                f"{self}",
-                "expected min_views, min_frames and max_views of at least 1, and nothing below 0",
-            )
         if self.max_views < self.min_views - 1:
             raise InputError(
                 "max_views",
@@ -248,12 +242,6 @@ class MapRules:
     published: bool = True
     """true: where camerasModel.txt (EndoMapper) lies beside the map, it says which keyframes are covisible, and
     --map-rules.points is not asked. false: the points always say it."""
-
-    def __post_init__(self) -> None:
-        if min(self.points, self.keyframes, self.between) < 1:
-            raise InputError(
-                "the rules of covisibility", f"{self}", "expected points, keyframes and between of at least 1"
-            )
 
 
 def select_by_map(
