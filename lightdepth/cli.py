@@ -145,6 +145,7 @@ def verb_parser(function: Any, verb: str) -> Parser:
     from lightdepth.command_line.options import add_groups, groups_of
     from lightdepth.command_line.parsing import Parser, finish
     from lightdepth.command_line.presets import preset_help, presets
+    from lightdepth.command_line.ranges import ranges_in
 
     said = {p.arg_name: p.description for p in parse_docstring(inspect.getdoc(function) or "").params}
     # The first line only: jsonargparse shows the rest of the docstring beside the options.
@@ -175,7 +176,7 @@ def verb_parser(function: Any, verb: str) -> Parser:
     parser.add_function_arguments(
         function, as_positional=True, sub_configs=True, skip={*declared, *groups_of(function)}
     )
-    finish(parser, PAGES.get(verb, Page()))
+    finish(parser, PAGES.get(verb, Page()), ranges_in(function))
     return parser
 
 

@@ -294,15 +294,15 @@ BAD_INPUT = {
     "format": (["densify", "DATA", "--map", "SLAM", "--formats", "[obj]", "--checkpoint", "decline"], "expected ply"),
     "scale": (
         ["densify", "DATA", "--map", "SLAM", "--mm_per_unit", "-1", "--checkpoint", "decline"],
-        "positive number",
+        "--mm-per-unit: -1.0; expected a number above 0",
     ),
     "light": (
         ["predict", "DATA", "--light", "gama=2", "--checkpoint", "decline"],
         "gama is not known (is gamma meant?)",
     ),
     "mask": (["predict", "DATA", "--mask", "NOWHERE", "--checkpoint", "decline"], "nowhere: no such mask"),
-    "frames": (["synth", "--frames", "0"], "--frames: 0; expected at least 1"),
-    "no pixels": (["synth", "--size", "[0, 0]"], "--size: [0, 0]; expected a width"),
+    "frames": (["synth", "--frames", "0"], "--frames: 0; expected a number from 1"),
+    "no pixels": (["synth", "--size", "[0, 0]"], "--size: [0, 0]; expected each number"),
     "too few frames": (["synth", "--frames", "2", "--size", "[24, 20]"], "render more frames"),
     "spurious": (["synth", "--spurious", "1.5"], "--spurious: 1.5"),
     "no run": (["evaluate", "NOWHERE", "--truth", "DATA"], "nowhere: no such folder"),

@@ -356,7 +356,7 @@ def test_truth_that_does_not_fit_is_refused_and_nothing_is_written(run, predicti
 
 def test_options_that_mean_nothing_are_refused(run, data, tmp_path):
     for options, message in (
-        ({"mm_per_unit": 0.0}, "expected a positive number of millimetres"),
+        ({"mm_per_unit": 0.0}, "above 0"),
         ({"thresholds_mm": ()}, "expected positive distances"),
         ({"thresholds_mm": (1.0, -2.0)}, "expected positive distances"),
     ):

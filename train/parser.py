@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from lightdepth.command_line.pages import PAGES
+from lightdepth.ranges import SEED
 
 from .trainer_options import TrainerSettings
 
@@ -25,6 +26,7 @@ def training_parser() -> Parser:
     """Every option of a training run: of the model, its data, how it is watched, and Lightning's Trainer."""
     from lightdepth.command_line.parsing import Parser, finish
     from lightdepth.command_line.presets import preset_help
+    from lightdepth.command_line.ranges import below, ranges_in
     from lightdepth.module import LightDepth
 
     from .datamodule import FrameData
@@ -47,7 +49,10 @@ def training_parser() -> Parser:
     assert parser.groups is not None
     parser.groups["model"].title = "How the network learns, and from which weights"
     parser.groups["trainer"].title = "Lightning's Trainer: device, length of the run, and what is logged"
-    finish(parser, PAGES["train"])
+    ranges = {"seed": SEED}
+    for group, made in (("model", LightDepth), ("data", FrameData), ("fit", FitConfig), ("trainer", TrainerSettings)):
+        ranges |= below(group, ranges_in(made))
+    finish(parser, PAGES["train"], ranges)
     return parser
 
 

@@ -7,11 +7,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from lightdepth.errors import InputError
+from lightdepth.ranges import above, at_least, checked
 
 
+@checked
 @dataclass(frozen=True)
 class TrainerSettings:
     """Lightning's Trainer: device, length of the run, and what is logged."""
@@ -30,10 +32,10 @@ class TrainerSettings:
     """How several devices share the work: ddp (each has a copy of the network and frames of its own), by processes that
     are started anew, or by ddp_spawn or ddp_fork otherwise; fsdp, which parts the network, too; auto lets Lightning
     choose."""
-    devices: list[int] | str | int = "auto"
+    devices: Annotated[list[int] | str | int, at_least(-1, up_to=100_000)] = "auto"
     """Number of devices to train on, or a list of the numbers of those to take, such as [0, 2]; auto takes all. More
     are faster, and each adds its own batch to every step."""
-    num_nodes: int = 1
+    num_nodes: Annotated[int, at_least(1, up_to=100_000)] = 1
     """Number of machines that train together. More are faster, and each adds its own batches to every step."""
     precision: int | str | None = None
     """Numbers that the network computes with: 32-true (also where it is left out), 16-mixed or bf16-mixed (16 bits
@@ -41,43 +43,43 @@ class TrainerSettings:
     logger: bool | Literal["tensorboard", "csv", "none"] | None = None
     """Where the curves of losses and errors are logged: tensorboard (true, or left out), as TensorBoard's files in the
     run folder; csv, as a table there; none (false), not at all."""
-    fast_dev_run: int | bool = False
+    fast_dev_run: Annotated[int | bool, at_least(0)] = False
     """Number of batches to train and to validate on in a trial run (true is one), which shows whether everything works:
     it exports a model, and logs no curves. More take longer; false or 0 is a whole run."""
-    max_epochs: int | None = None
+    max_epochs: Annotated[int | None, at_least(-1)] = None
     """Number of epochs (passes over the training frames) after which training ends, if max_steps does not end it
     sooner; null or -1 for no limit. More train longer."""
-    min_epochs: int | None = None
+    min_epochs: Annotated[int | None, at_least(0)] = None
     """Least number of epochs (passes over the training frames) before --fit.patience or max_time may end the run; null
     for none. More train longer."""
-    max_steps: int = 1500
+    max_steps: Annotated[int, at_least(-1)] = 1500
     """Number of steps (changes of the weights) after which training ends; -1 for no limit. More train longer."""
-    min_steps: int | None = None
+    min_steps: Annotated[int | None, at_least(0)] = None
     """Least number of steps (changes of the weights) before --fit.patience or max_time may end the run; null for none.
     More train longer."""
-    max_time: str | dict[str, int] | None = None
+    max_time: Annotated[str | dict[str, int] | None, at_least(0)] = None
     """Time after which training ends, if max_steps does not end it sooner, as days:hours:minutes:seconds; left out, no
     limit. A longer one trains longer."""
-    limit_train_batches: int | float | None = None
+    limit_train_batches: Annotated[int | float | None, above(0)] = None
     """How much of the training frames an epoch has: a share of their batches (0.5), or a number of batches (5); left
     out, all. More show more frames in an epoch; how long a run takes, max_steps says."""
-    limit_val_batches: int | float | None = None
+    limit_val_batches: Annotated[int | float | None, above(0)] = None
     """How much of the validation frames is used: a share of their batches (0.5), or a number of batches (5); left out,
     all. More judge more surely and take longer."""
-    overfit_batches: int | float = 0.0
+    overfit_batches: Annotated[int | float, at_least(0)] = 0.0
     """Share (0.5) or number (5) of the training batches that are trained on again and again, in one order, to see
     whether the network can learn them by heart; as much is validated on. 0.0 trains as usual. More are harder to learn
     by heart."""
-    val_check_interval: int | float | str | dict[str, int] | None = 250
+    val_check_interval: Annotated[int | float | str | dict[str, int] | None, above(0)] = 250
     """Number of batches from one validation to the next, max_steps at most; or a time, days:hours:minutes:seconds; or,
     where check_val_every_n_epoch is a number, a share of an epoch, such as 0.5. Larger values validate less often."""
-    check_val_every_n_epoch: int | None = None
+    check_val_every_n_epoch: Annotated[int | None, at_least(1)] = None
     """Number of epochs (passes over the training frames) from one that is validated to the next; null lets
     val_check_interval count batches, whatever the epoch. More validate less often."""
-    num_sanity_val_steps: int | None = 0
+    num_sanity_val_steps: Annotated[int | None, at_least(-1)] = 0
     """Number of validation batches that are tried before training, so that what is wrong with them shows at once; 0 for
     none, -1 for all. More find mistakes more surely, and training begins later."""
-    log_every_n_steps: int | None = 10
+    log_every_n_steps: Annotated[int | None, at_least(0)] = 10
     """Number of steps from one point of the logged training curves to the next. More make coarser curves and smaller
     files."""
     enable_progress_bar: bool | None = None
@@ -86,10 +88,10 @@ class TrainerSettings:
     enable_model_summary: bool | None = False
     """true: the layers of the network and their numbers of weights are listed before training begins. false: they are
     not."""
-    accumulate_grad_batches: int = 1
+    accumulate_grad_batches: Annotated[int, at_least(1)] = 1
     """Number of batches whose mean gradient makes one step, as one larger batch would, in less memory. More make
     steadier steps, and as many steps take longer."""
-    gradient_clip_val: int | float | None = 1.0
+    gradient_clip_val: Annotated[int | float | None, at_least(0)] = 1.0
     """Norm above which the gradient of a step is scaled down to it (with gradient_clip_algorithm value: size above
     which each of its values is cut); null and 0 never do. A larger one lets larger steps through."""
     gradient_clip_algorithm: Literal["norm", "value"] | None = None
@@ -116,7 +118,7 @@ class TrainerSettings:
     sync_batchnorm: bool = False
     """Of several devices, true takes the mean and deviation of batch normalisation over the frames of all of them, and
     false over those of each. With one device it changes nothing."""
-    reload_dataloaders_every_n_epochs: int = 0
+    reload_dataloaders_every_n_epochs: Annotated[int, at_least(0)] = 0
     """Number of epochs (passes over the training frames) after which what reads the frames is started anew; 0 for
     never. The frames stay the same. More do it less often."""
 

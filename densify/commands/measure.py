@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -12,17 +13,18 @@ from densify.measure import chosen_map, measured, places_in_frame, run_unit
 from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
+from lightdepth.ranges import ANY, above, at_least
 from lightdepth.reporting.run import plain
 
 
 def measure(
     run: Path,
-    points: list[tuple[float, float, float]] | None = None,
-    frame: int | None = None,
-    pixels: list[tuple[float, float]] | None = None,
-    radius: float | None = None,
-    map: int | None = None,
-    mm_per_unit: float | None = None,
+    points: Annotated[list[tuple[float, float, float]] | None, ANY] = None,
+    frame: Annotated[int | None, at_least(0, up_to=1e19)] = None,
+    pixels: Annotated[list[tuple[float, float]] | None, ANY] = None,
+    radius: Annotated[float | None, above(0)] = None,
+    map: Annotated[int | None, at_least(0)] = None,
+    mm_per_unit: Annotated[float | None, above(0)] = None,
     output: Path | None = None,
 ) -> None:
     """Lengths and areas on a surface of a densify run: between two places, around one, inside an outline of more.

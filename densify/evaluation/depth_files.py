@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -30,6 +30,7 @@ from lightdepth.files.headers import what_is_there
 from lightdepth.files.images import read_bytes, read_raw
 from lightdepth.geometry import distance_from_depth
 from lightdepth.prediction import DepthPrediction, read_prediction
+from lightdepth.ranges import above, checked
 
 DepthKind = Literal["distance", "depth", "disparity"]
 SUFFIXES = ("npz", "npy", "exr", "tiff", "tif", "png")
@@ -40,6 +41,7 @@ _LEAST_RAY_Z = 0.05  # as of true depth: farther to the side, depth along the ax
 
 
 @dataclass(frozen=True)
+@checked
 class DepthReading:
     """How a folder of depth is read. Without a kind it is one that `lightdepth predict` made."""
 
@@ -47,7 +49,7 @@ class DepthReading:
     """What the numbers of another program's depth files are (.npy, .npz, EXR, TIFF, 16-bit PNG): distance along the
     ray, depth along the axis, or disparity, which is one over depth. Left out, the folder is one of `lightdepth
     predict`."""
-    depth_scale: float | None = None
+    depth_scale: Annotated[float | None, above(0)] = None
     """Factor from the numbers in another program's depth files to mm (of disparity: depth is the factor over it). Left
     out, they are up to scale, or as `lightdepth export` says in its run.json. A larger one makes a farther wall."""
 

@@ -19,18 +19,15 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
 import yaml
-from jsonargparse import (
-    ArgumentParser,
-    DefaultHelpFormatter,
-    Namespace,
-    set_parsing_settings,
-)
+from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
 
 from lightdepth import plain_yaml
 from lightdepth.command_line.gone_settings import GONE_SETTINGS
 from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, literals, placeholder
 from lightdepth.command_line.pages import Page
+from lightdepth.command_line.ranges import check_ranges, range_in, set_ranges, taken
 from lightdepth.command_line.settings_yaml import read_settings, take_plain_values, use_words
+from lightdepth.ranges import Range
 from lightdepth.regular import regular
 
 HELP, HELP_ALL = ("-h", "--help"), ("--help-all", "--help_all")
@@ -56,8 +53,9 @@ class Formatter(DefaultHelpFormatter):
     def _get_help_string(self, action: argparse.Action) -> str:
         """The sentence, and in brackets what kind of value is taken, where its placeholder does not show it."""
         kind, notes = getattr(action, "_typehint", None), ["required"] if action.required else []
-        if any(one in (int, float) for one in choices_of_type(kind)) or not METAVARS.keys() >= leaves(kind):
-            notes.append(expected(kind))
+        within = range_in(action)
+        if any(one in (int, float) for one in choices_of_type(kind)) or not METAVARS.keys() >= leaves(kind) or within:
+            notes.append(taken(kind, within))
         if action.default not in (None, argparse.SUPPRESS, ()) and action.nargs != 0:
             shown = (
                 action.default if isinstance(action.default, (str, Path)) else json.dumps(action.default, default=str)
@@ -148,9 +146,10 @@ def _is_head(action: argparse.Action) -> bool:
     return type(action).__name__ == "_ActionConfigLoad"
 
 
-def finish(parser: Parser, page: Page) -> None:
-    """Gives a parser that has all its options its page, and what the library says of its own options in our words."""
+def finish(parser: Parser, page: Page, ranges: Mapping[str, Range]) -> None:
+    """Gives a parser that has all its options its page and their ranges, and the library's own options our words."""
     parser.page = page
+    set_ranges(parser._actions, ranges)
     plain = [a for a in options(parser) if "." not in a.dest]
     order = sorted(plain, key=lambda a: (bool(a.option_strings), a.dest != "output", a.dest in _LAST))
     for group in parser._action_groups:
@@ -177,9 +176,17 @@ def parsed(parser: Parser, argv: Sequence[str]) -> Namespace:
     for file in config_files(argv):
         _check_config(parser, file)
     try:
-        return parser.parse_args(spelled(parser, argv))
+        found = parser.parse_args(spelled(parser, argv))
     except (argparse.ArgumentError, ImportError) as error:
         fail(parser, one_line(parser, argv, str(error)))
+    check_ranges(options(parser), found.get, lambda action: _where(argv, action))
+    return found
+
+
+def _where(argv: Sequence[str], action: argparse.Action) -> str:
+    """An option as it was given: on the command line, or in a file of settings."""
+    name = f"--{dashed(action.dest)}" if action.option_strings else action.dest
+    return name if _on_line(argv, action.dest) else f"{_file_with(argv, action.dest)}{name}"
 
 
 def fail(parser: Parser, message: str) -> NoReturn:
@@ -286,8 +293,8 @@ def one_line(parser: Parser, argv: Sequence[str], message: str) -> str:
     else:
         said = " ".join(message.split())
     everyday = not name or parser.page.shows(name.lstrip("-").replace("-", "_"))
-    stop = "" if said.endswith("?") else "."
-    return f"{said}{stop} Read on: {parser.prog} {'--help' if everyday and '.' not in name else '--help-all'}"
+    page = "--help" if everyday and "." not in name else "--help-all"
+    return f"{said}{'.' * (not said.endswith('?'))} Read on: {parser.prog} {page}"
 
 
 def _unknown(parser: Parser, word: str) -> tuple[str, str]:
@@ -302,9 +309,8 @@ def _unknown(parser: Parser, word: str) -> tuple[str, str]:
 
 
 def _names(parser: Parser) -> list[str]:
-    return [o[2:] for a in options(parser) for o in a.option_strings if o.startswith("--")] + [
-        a.dest for a in options(parser) if not a.option_strings
-    ]
+    long = [o[2:] for a in options(parser) for o in a.option_strings if o.startswith("--")]
+    return long + [a.dest for a in options(parser) if not a.option_strings]
 
 
 def closest(word: str, known: Sequence[str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from lightdepth.files.writing import write_together
 from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.light.report import light_page
+from lightdepth.ranges import SEED, Range
 
 
 def calibrate_light(
@@ -27,8 +29,8 @@ def calibrate_light(
     format: FormatName | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
-    bit_depth: int | None = None,
-    seed: int = 0,
+    bit_depth: Annotated[int | None, Range(8, 32)] = None,
+    seed: Annotated[int, SEED] = 0,
     pairing: Group[PairingConfig] = PairingConfig(),
     overwrite: bool = False,
 ) -> None:

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from lightdepth import camera_conversion
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.datasets.sequence import read_mask
 from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_files
+from lightdepth.ranges import PIXELS, at_least
 
 
 def convert_camera(
     file: Path,
     output: Path,
     model: Literal["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "SCARAMUZZA"] | None = None,
-    size: tuple[int, int] | None = None,
+    size: Annotated[tuple[int, int] | None, PIXELS] = None,
     to: Literal["json", "vicalib", "opencv", "colmap", "ocamcalib", "intrinsics", "intrinsics4x4"] | None = None,
     mask: Path | None = None,
-    most_px: float | None = None,
+    most_px: Annotated[float | None, at_least(0)] = None,
     overwrite: bool = False,
 ) -> None:
     """A calibration file in another format, or as another lens model, and by how many pixels that differs.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -26,6 +26,7 @@ from lightdepth.network.heads import (
 from lightdepth.network.tiny import TinyUNet
 from lightdepth.network.unet import ResNetUNet
 from lightdepth.photometry import LightTerms
+from lightdepth.ranges import SHARE, at_least, checked
 
 Input = Literal["rgb", "closed_form", "ray_z", "mask", "reflectance"]
 Encoder = Literal["resnet18", "resnet34", "resnet50", "vitt14", "vits14", "vitb14", "vitl14"]
@@ -37,6 +38,7 @@ _DEFAULT_ENCODER = {"unet": "resnet18", "dpt": "vits14"}
 
 
 @dataclass(frozen=True)
+@checked
 class NetworkConfig:
     """Which network. Plain values, so that it travels as JSON inside a checkpoint."""
 
@@ -58,13 +60,13 @@ class NetworkConfig:
     uncertainty: bool = False
     """true: the network also says how uncertain it is at each pixel, the standard deviation of log distance; it learns
     that where --model.loss.uncertainty is above 0. false: it gives distance and albedo (the wall's colour) only."""
-    width: int = 16
+    width: Annotated[int, at_least(1, up_to=1024)] = 16
     """Number of channels of the first level of the tiny network; deeper levels have 2 to 6 times as many, and other
     kinds do not use it. More make a stronger and slower network."""
     norm: Literal["batch", "group"] = "group"
     """How the tiny network normalises its channels: "batch", by mean and deviation over all images of a batch; "group",
     over groups of channels of each image by itself, whatever the size of the batch. Other kinds do not use it."""
-    blur: float = 0.018
+    blur: Annotated[float, SHARE] = 0.018
     """Deviation (sigma) of the Gaussian blur of the closed form (distance from brightness alone), as network input and
     under the output "residual", as a share of the image height; 0 for none. A larger one leaves less of the image's
     texture in it."""

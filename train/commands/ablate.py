@@ -14,6 +14,7 @@ import re
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated
 
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files import replacing
@@ -27,6 +28,7 @@ from lightdepth.files.replacing import (
     stamp,
     unfinished_path,
 )
+from lightdepth.ranges import SEED
 from lightdepth.reporting.run import recorded, write_run_json
 from lightdepth.reporting.same import paths_in
 from lightdepth.reporting.unfinished import begin
@@ -48,7 +50,7 @@ def ablate(
     settings: Settings | None = None,
     rows: tuple[Row, ...] = (),
     judged: tuple[JudgedColons, ...] = (),
-    seeds: tuple[int, ...] = (0, 1, 2),
+    seeds: Annotated[tuple[int, ...], SEED] = (0, 1, 2),
     table: Path | None = None,
     overwrite: bool = False,
 ) -> None:

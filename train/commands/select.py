@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import Content, write_together
 from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
+from lightdepth.ranges import Range, checked
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.report import Report
@@ -46,6 +47,7 @@ _SHOWN = 48  # pictures of kept and of rejected frames each
 
 
 @dataclass(frozen=True)
+@checked
 class SelectConfig:
     """What is covisible and what is kept, by each way of telling."""
 
@@ -57,7 +59,7 @@ class SelectConfig:
     """weights and thresholds of the loftr matcher"""
     loftr_nodes: NodeRules = LOFTR_NODES
     """what is covisible and what is kept, with the loftr matcher"""
-    bit_depth: int | None = None
+    bit_depth: Annotated[int | None, Range(8, 32)] = None
     """Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what their
     highest values show. A larger one reads the same numbers as darker."""
     map_rules: MapRules = field(default_factory=MapRules)
