@@ -33,7 +33,6 @@ from lightdepth.datasets.dicom_parts import (
 from lightdepth.datasets.video import VideoFile
 from lightdepth.errors import InputError
 from lightdepth.files.headers import header_in
-from lightdepth.files.reading import check_pixels
 from lightdepth.regular import irregular
 
 DICOM_SUFFIXES = (".dcm", ".dicom", ".dic")
@@ -49,7 +48,7 @@ _NATIVE = {"1.2.840.10008.1.2": True, "1.2.840.10008.1.2.1": False}  # whether t
 _COMPRESSED = "1.2.840.10008.1.2.4."
 _VIDEOS = tuple(f"{_COMPRESSED}{n}" for n in range(100, 109))  # MPEG-2, H.264, HEVC, and their fragmented kin
 _RLE = "1.2.840.10008.1.2.5"
-_MOST_FRAMES = 10**6
+_MOST_PIXELS, _MOST_FRAMES = 2**26, 10**6
 _MOST_MISSING = 1000  # announced frames for each one that is there, from which the number is wrong and no file cut off
 _LONGEST_MS = 1e5  # from a frame to the next
 _CONVERT = "convert it without compression (dcmdjpeg of DCMTK, or gdcmconv --raw), or export a video"
@@ -163,7 +162,8 @@ def _checked(
     samples, allocated = _whole(said, "SamplesPerPixel", path, 1), _whole(said, "BitsAllocated", path, 8)
     stored, colours = _whole(said, "BitsStored", path, allocated), str(said["PhotometricInterpretation"] or "").strip()
     video = syntax.startswith(_VIDEOS)
-    check_pixels(width, height, path)
+    if not 0 < width * height <= _MOST_PIXELS:
+        raise InputError(path, f"DICOM pictures of {width}x{height}", f"expected up to {_MOST_PIXELS} pixels")
     if not video:
         if (colours not in _COLOURS or samples != 3) and (colours not in _GREYS or samples != 1):
             known = colours if colours in (*_COLOURS, *_GREYS, *_OTHERS) else "of another kind"  # or a name, astray
