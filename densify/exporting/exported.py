@@ -18,6 +18,7 @@ from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.below import given
 from lightdepth.files.meshes import load_mesh
+from lightdepth.files.reading import reading
 from lightdepth.geometry import depth_from_distance
 from lightdepth.maps import read_map
 from lightdepth.maps.endocartoscope import TrajectoryPose, read_trajectory, trajectory_path
@@ -176,7 +177,8 @@ def _without_observations(folder: Path, dense: DenseMapFiles) -> Submap:
     """Keyframes as the run's files have them: names, camera, poses."""
     names = {int(n): f"{int(n):06d}" for n in dense.numbers}
     if (folder / "keyframes.csv").is_file():
-        with (folder / "keyframes.csv").open(encoding="utf-8", newline="") as file:
+        path = folder / "keyframes.csv"
+        with reading(path, "a table of keyframes"), path.open(encoding="utf-8", newline="") as file:
             names |= {int(row["frame"]): row["keyframe"] for row in csv.DictReader(file)}
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     keyframes = tuple(
@@ -189,6 +191,9 @@ def _without_observations(folder: Path, dense: DenseMapFiles) -> Submap:
 def _looks(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Colours (n, 3) uint8 and unit normals (n, 3) of a mesh file's vertices."""
     mesh: Any = load_mesh(path)
-    colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(np.uint8)
-    assert len(colors) == count, (len(colors), count)
-    return colors, np.asarray(mesh.vertex_normals, float)
+    with reading(path, "a mesh with colours"):
+        colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(np.uint8)
+        normals = np.asarray(mesh.vertex_normals, float)
+    if len(colors) != count:
+        raise InputError(path, f"{len(colors)} colours of {count} vertices", "expected one each")
+    return colors, normals

@@ -28,7 +28,7 @@ from lightdepth.calibration.vicalib import read_photometric, read_vicalib, write
 from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.errors import InputError
 from lightdepth.files.colmap_cameras import read_cameras_binary
-from lightdepth.files.reading import reading
+from lightdepth.files.reading import MOST_TEXT, check_bytes, reading
 from lightdepth.files.schema import read_json
 from lightdepth.files.text import read_text, rows
 from lightdepth.photometry import PhotometricCalibration
@@ -60,6 +60,7 @@ def read_camera(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
     cannot be read.
     """
     with reading(path, "a camera calibration"):
+        check_bytes(Path(path).stat().st_size if Path(path).is_file() else 0, MOST_TEXT, path, "calibration")
         return _in_pixels(_read(Path(path), size), path)
 
 

@@ -15,12 +15,14 @@ from typing import Self
 
 from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
-from lightdepth.files.reading import reading
+from lightdepth.files.reading import check_bytes, reading
 
 VIDEO = Path("data") / "rgb.mp4"
 IMAGES = {"left": "Left_Image.png", "right": "Right_Image.png"}
 _LARGEST = 128 << 20
 """Bytes of one member of an archive: a scene's points are 31 MB."""
+_RECORD = 1 << 20
+"""Bytes of one member that is read with all others: a frame's data are 2 KB."""
 _ALL = 256 << 20
 """Bytes of an archive that is read whole, once unpacked: the frame data of an hour are as many."""
 _MOST_MEMBERS = 200_000
@@ -53,9 +55,14 @@ class Folder:
 
     def get(self, number: int) -> tuple[str, bytes] | None:
         file = self._files.get(number)
-        return None if file is None else (str(file), file.read_bytes())
+        if file is None:
+            return None
+        check_bytes(file.stat().st_size, _LARGEST, file)
+        return str(file), file.read_bytes()
 
     def all(self) -> list[tuple[int, str, bytes]]:
+        for file in self._files.values():
+            check_bytes(file.stat().st_size, _RECORD, file)
         return [(n, str(file), file.read_bytes()) for n, file in self._files.items()]
 
 
@@ -88,6 +95,7 @@ class Archive:
                 if self._tar is not None and self._tar.offset > _ALL:
                     raise InputError(self._path, f"more than {_ALL} bytes once unpacked", f"expected at most {_ALL}")
                 if number is not None:
+                    check_bytes(self._found[number].size, _RECORD, self._path, "member")
                     members.append((number, *self._read(number)))
         return members
 

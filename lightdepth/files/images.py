@@ -146,6 +146,7 @@ def _single(data: bytes, where: str) -> Header | None:
 
 def decode(data: bytes, flags: int, where: str, head: Header | None = None) -> np.ndarray:
     """cv2's image in a file's bytes. imdecode refuses a truncated JPEG, whose rest imread would paint grey."""
+    head = head or header_in(data, where)
     buffer, image = np.frombuffer(as_stored(data) if head is not None and head.kind == "TIFF" else data, np.uint8), None
     if head is None:  # its size is not known before it is decoded
         raise InputError(where, "not a readable image (no header that is known)", "copy it again, or leave it out")

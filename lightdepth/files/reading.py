@@ -25,8 +25,8 @@ MOST_PIXELS = 2**25
 """Pixels of one picture: 8192 x 4096 (8K video fits). A larger one is refused by its header, before it is decoded."""
 LONGEST_SIDE = 65535
 """Pixels of a picture's or a camera's side."""
-MOST_TEXT = 64 << 20
-"""Bytes of a calibration or another small text: a thousand times what the longest that is known has."""
+MOST_TEXT = 16 << 20
+"""Bytes of a calibration or another small text: nerfstudio's with ten thousand frames has as many."""
 
 
 @contextmanager
