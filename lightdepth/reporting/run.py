@@ -202,6 +202,8 @@ def git_revision() -> str | None:
 
 def input_hash(path: Path) -> str:
     """SHA-256 over names and sizes of the files below a path, and over the contents of those up to 1 MB."""
+    if not path.exists():
+        raise InputError(path, "no such file or folder", "correct its name, or put it there")
     digest = hashlib.sha256()
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     for file in files:
