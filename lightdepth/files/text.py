@@ -37,7 +37,7 @@ def to_numbers(words: list[str], where: str, expected: str) -> list[float]:
         try:
             numbers.append(float(word))
         except ValueError:
-            raise InputError(where, f"found {word!r}, which is not a number", f"expected {expected}") from None
+            raise InputError(where, f"found {word[:60]!r}, which is not a number", f"expected {expected}") from None
         if not np.isfinite(numbers[-1]):
             raise InputError(where, f"{word} is not finite", f"expected {expected}")
     return numbers
@@ -75,7 +75,7 @@ def parse_numbers(tokens: list[str], where: str, expected: str) -> np.ndarray:
             try:
                 float(token)
             except ValueError:
-                raise InputError(where, f"found {token!r}, which is not a number", f"expected {expected}") from None
+                raise InputError(where, f"found {token[:60]!r}, which is not a number", f"expected {expected}") from None
         raise
 
 
@@ -83,4 +83,4 @@ def parse_integer(token: str, where: str, expected: str) -> int:
     try:
         return int(token)
     except ValueError:
-        raise InputError(where, f"found {token!r}, which is not an integer", f"expected {expected}") from None
+        raise InputError(where, f"found {token[:60]!r}, which is not an integer", f"expected {expected}") from None
