@@ -75,7 +75,9 @@ def parse_numbers(tokens: list[str], where: str, expected: str) -> np.ndarray:
             try:
                 float(token)
             except ValueError:
-                raise InputError(where, f"found {token[:60]!r}, which is not a number", f"expected {expected}") from None
+                raise InputError(
+                    where, f"found {token[:60]!r}, which is not a number", f"expected {expected}"
+                ) from None
         raise
 
 
