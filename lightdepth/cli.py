@@ -26,7 +26,7 @@ from lightdepth import __version__
 from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.command_line.pipes import outliving_readers
 from lightdepth.command_line.warned import warnings_as_sentences
-from lightdepth.errors import AlreadyFinished, InputError, MachineFailure, PartialFailure
+from lightdepth.errors import AlreadyFinished, InputError, MachineFailure, MissingOption, PartialFailure
 
 GROUP = "lightdepth.commands"
 ORDER = (
@@ -67,7 +67,7 @@ def _main(argv: list[str]) -> int:
         print(f"lightdepth: {error}", file=sys.stderr)
         return 3
     commands = {entry.name: entry for entry in metadata.entry_points(group=GROUP)}
-    if not argv or argv[0] in ("-h", "--help"):
+    if not argv or argv[0] in ("-h", "--help", "--help-all"):
         print(_help(commands))
         return 0 if argv else 2
     if argv[0] in ("-V", "--version"):
@@ -86,6 +86,9 @@ def _main(argv: list[str]) -> int:
         if list(inspect.signature(function).parameters) == ["argv"]:
             return function(rest) or 0
         return function(**parse(function, verb, rest)) or 0
+    except MissingOption as error:
+        print(f"lightdepth {verb}: {error}", file=sys.stderr)
+        return 2
     except InputError as error:
         print(f"lightdepth {verb}: {error}", file=sys.stderr)
         return 3

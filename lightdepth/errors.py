@@ -32,6 +32,10 @@ class InputError(ValueError):
         return InputError(f"{outer}: {self.where}", self.found, self.cure)
 
 
+class MissingOption(InputError):
+    """An option that has to be given and was not: wrong usage. Exit code 2."""
+
+
 class PartialFailure(RuntimeError):
     """Part of the work failed; the rest was done and written. Exit code 4; `run.json` says what failed."""
 

@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 
 from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel
+from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.observations import ObservedDistances, sample_distance
 from lightdepth.prediction import DepthPrediction
@@ -67,6 +68,10 @@ class ParallaxConfig:
     off_line: Annotated[float, at_least(0)] = 1.0
     """Distance of what two keyframes both show from its epipolar line, the median in pixels, above which the images
     tell how the two stood to each other, in place of the map's poses. A larger one trusts the map's poses more."""
+
+    def __post_init__(self) -> None:
+        if self.patch % 2 == 0:
+            raise InputError("parallax.patch", f"{self.patch}", "expected an odd number, such as 7")
 
 
 @dataclass(frozen=True, repr=False)

@@ -160,7 +160,7 @@ class _AllBroken(list):
 
 
 def test_rules_that_cannot_hold_are_refused():
-    with refused(found="min_views"):
+    with refused(where="NodeRules.min_views"):
         replace(RULES, min_views=0)
     with refused(found="no node could have"):
         replace(RULES, min_views=9, max_views=5)

@@ -78,7 +78,7 @@ class FrameData:
     """true: one half of each batch is frames of the sequences, the other of synthetic colons (of an odd number the
     sequences have one more). false: all are shuffled together, so that there are most of what has most frames. Without
     both kinds it changes nothing."""
-    size: Annotated[tuple[int, int], at_least(32, up_to=10_000)] = (160, 128)
+    size: Annotated[tuple[int, int], at_least(16, up_to=10_000)] = (160, 128)
     """Width and height that the images are resized to, pixels, to train, validate and predict at. A larger one shows
     finer detail and takes longer."""
     batch_size: Annotated[int, at_least(1, up_to=100_000)] = 4

@@ -23,7 +23,7 @@ from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_pa
 
 from lightdepth import plain_yaml
 from lightdepth.command_line.gone_settings import GONE_SETTINGS
-from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, literals, placeholder
+from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, list_apart, literals, placeholder
 from lightdepth.command_line.pages import Page
 from lightdepth.command_line.ranges import check_ranges, range_in, set_ranges, taken
 from lightdepth.command_line.settings_yaml import read_settings, take_plain_values, use_words
@@ -346,6 +346,8 @@ def _wrong_value(parser: Parser, argv: Sequence[str], key: str, message: str) ->
         return f"{where}{named} {' '.join(message.split())}"
     choices = [c for one in choices_of_type(kind) for c in literals(one)]
     hint = _nearest(value, [str(c) for c in choices]) if choices else ""
+    if action is not None and (apart := list_apart(argv, value)) and get_origin(next(choices_of_type(kind))) is tuple:
+        hint = f"; give them as one word: {apart}"
     return f"{where}{named} {value}: expected {expected(kind)}{hint}"
 
 

@@ -42,6 +42,8 @@ def convert_camera(
         overwrite: Replace a file made before.
     """
     check_files([output], overwrite, [file, mask])
+    if most_px is not None and model is None:
+        raise InputError("--most-px", "given without --model", "leave it out: it is of the fit of another lens model")
     if size is not None and min(size) < 1:
         raise InputError("--size", f"{list(size)}", "expected a width and a height of some pixels")
     if most_px is not None and not most_px > 0:

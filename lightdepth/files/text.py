@@ -39,7 +39,7 @@ def to_numbers(words: list[str], where: str, expected: str) -> list[float]:
         try:
             numbers.append(float(word))
         except ValueError:
-            raise InputError(where, f"found {word!r}, which is not a number", f"expected {expected}") from None
+            raise InputError(where, f"found {word[:60]!r}, which is not a number", f"expected {expected}") from None
         if not np.isfinite(numbers[-1]):
             raise InputError(where, f"{word} is not finite", f"expected {expected}")
     return numbers
@@ -77,7 +77,9 @@ def parse_numbers(tokens: list[str], where: str, expected: str) -> np.ndarray:
             try:
                 float(token)
             except ValueError:
-                raise InputError(where, f"found {token!r}, which is not a number", f"expected {expected}") from None
+                raise InputError(
+                    where, f"found {token[:60]!r}, which is not a number", f"expected {expected}"
+                ) from None
         raise
 
 

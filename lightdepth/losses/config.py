@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from lightdepth.errors import InputError
-from lightdepth.ranges import BELOW_ONE, BETWEEN, SHARE, Range, at_least, checked
+from lightdepth.ranges import BELOW_ONE, SHARE, Range, at_least, checked
 
 SPACES = ("log", "encoded", "linear")
 GAINS = ("free", "one")
@@ -66,8 +66,8 @@ class LossConfig:
     cosine_exponent: Annotated[float, at_least(0, up_to=100)] = 0.5
     """Exponent of the cosine of the angle at which light meets the wall, in rendered light: 1 is a matt (Lambert's)
     wall; at 0 the angle counts for nothing. A larger one renders slanted wall darker."""
-    cosine_floor: Annotated[float, BETWEEN] = 0.03
-    """Least cosine of the angle at which light meets the wall, above 0 and below 1: what is more slanted is rendered as
+    cosine_floor: Annotated[float, BELOW_ONE] = 0.03
+    """Least cosine of the angle at which light meets the wall, below 1: what is more slanted is rendered as
     if it had this one, and `facing` counts it. A larger one renders edge-on wall brighter and makes more of it
     count."""
     ambient: Annotated[float, at_least(0)] = 0.0

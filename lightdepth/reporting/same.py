@@ -64,6 +64,8 @@ def paths_in(value: Any) -> list[Path]:
 def input_hash(path: Path, without: Path | None = None) -> str:
     """SHA-256 over names and sizes of the files below a path, and over the contents of those up to 1 MB. Results of
     runs below it are passed over, and so is `without`, a folder that is being made."""
+    if not path.exists():
+        raise InputError(path, "no such file or folder", "correct its name, or put it there")
     digest = hashlib.sha256()
     files = files_below(path, without) if path.is_dir() else [path]
     for file in files:

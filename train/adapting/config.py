@@ -29,7 +29,7 @@ class AdaptConfig:
     batch_size: Annotated[int, at_least(1, up_to=100_000)] = 4
     """Number of frames in a batch, from which each step learns. More make steadier steps and take more time and
     memory."""
-    size: Annotated[tuple[int, int] | None, at_least(32, up_to=10_000)] = None
+    size: Annotated[tuple[int, int] | None, at_least(16, up_to=10_000)] = None
     """Width and height that images are resized to for training, pixels; left out, the height that the checkpoint was
     trained at, and the width that goes with it. A larger one shows finer detail and takes longer."""
     what: What = "all"
