@@ -21,7 +21,7 @@ import pytest
 from mutants.forked import OPTIONS, forked_value
 from mutants.modules import PACKAGES, ROOT, TESTS
 
-LONGEST = 15.0
+LONGEST = 4.0
 """Seconds of processor time, with lines being traced, beyond which a test is not used."""
 
 

@@ -25,9 +25,8 @@ _FILES = {
 
 TEST_FILES = """
     camera camera_conversion lenses calibration_formats geometry photometry robust radiosity losses decline frame
-    alignment agreement agreement_mutants bending trust dense_map metrics refine light_fit
-    fusion marching marching_cubes plain_fusion rectify second_core compiled coverage measure
-    trajectory surface_errors relative_pose observations prediction
+    alignment agreement agreement_mutants bending metrics refine relative_pose observations prediction trajectory
+    marching_cubes tiny_fusion second_core compiled plain_fusion
 """
 
 

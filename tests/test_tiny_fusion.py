@@ -1,0 +1,275 @@
+"""Views of a few pixels and volumes of a few blocks, each compared with what plain NumPy makes of the same words."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from test_fusion import by_hand, shifted, sums
+
+from densify.fusion.marching_cubes import CORNERS, packed, unpacked
+from densify.fusion.patches import BlockSurface, joined
+from densify.fusion.rectify import FULL, RectifyConfig, SurfaceView, surface_view
+from densify.fusion.volume import FusionConfig, TsdfVolume
+from lightdepth.camera import Pinhole
+from lightdepth.prediction import DepthPrediction
+
+CAMERA = Pinhole(14, 11, 14.0, 15.0, 6.2, 5.9)
+VOXEL = 0.16
+
+
+def predicted(distance: np.ndarray, valid: np.ndarray | None = None, camera: Pinhole = CAMERA) -> DepthPrediction:
+    known = np.ones(distance.shape, bool) if valid is None else valid
+    return DepthPrediction("1", distance.astype(np.float32), known, camera, "closed form")
+
+
+def slanted(camera: Pinhole = CAMERA) -> np.ndarray:
+    """The distance (H, W) to a plane that is seen at a slant."""
+    found: np.ndarray = 2.0 / (camera.rays()[0] @ np.array([0.25, -0.35, 0.9]))
+    return found
+
+
+def colours(camera: Pinhole = CAMERA) -> np.ndarray:
+    return np.random.default_rng(3).uniform(0.1, 0.9, (camera.height, camera.width, 3)).astype(np.float32)
+
+
+@cache
+def looks() -> list[tuple[SurfaceView, np.ndarray]]:
+    """Two views of about the same wall, and their poses; of the second, some pixels know nothing."""
+    turned = shifted(0.3, -0.2, 0.1)
+    turned[:3, :3] = np.linalg.qr(np.array([[1, 0.2, -0.1], [-0.2, 1, 0.15], [0.1, -0.15, 1.0]]))[0]
+    turned[:3, :3] *= np.sign(np.diag(turned[:3, :3]))
+    known = np.random.default_rng(0).random((11, 14)) < 0.9
+    return [
+        (surface_view(predicted(slanted()), colours(), RectifyConfig()), np.eye(4)),
+        (surface_view(predicted(slanted() + 0.05, known), 1 - colours(), RectifyConfig()), turned),
+    ]
+
+
+def fused(count: int = 2, **config) -> TsdfVolume:
+    volume = TsdfVolume(VOXEL, FusionConfig(**config))
+    for view, pose in looks()[:count]:
+        volume.integrate(view, pose)
+    return volume
+
+
+# Blocks
+
+
+def blocks_of(view: SurfaceView, pose: np.ndarray) -> np.ndarray:
+    """Packed places of the blocks that every fourth known pixel, the ends of its ray's truncation, and its two sides
+    fall into."""
+    map_from_cam = np.linalg.inv(pose)
+    found = []
+    for pixel in np.flatnonzero(view.weights)[::4]:
+        point, normal = view.points[:, pixel], view.planes[pixel, :3]
+        ray = point / np.linalg.norm(point) * 6 * VOXEL
+        for place in (point, point + ray, point - ray, point + 2 * VOXEL * normal, point - 2 * VOXEL * normal):
+            found.append(np.floor((map_from_cam[:3, :3] @ place + map_from_cam[:3, 3]) / (8 * VOXEL)))
+    return np.unique(packed(np.array(found)))
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_view_opens_the_blocks_along_its_rays_and_holds_those_it_says_something_of(which):
+    view, pose = looks()[which]
+    volume = TsdfVolume(VOXEL, FusionConfig())
+    changed = volume.integrate(view, pose)
+    opened = blocks_of(view, pose)
+    said = by_hand(view, pose, VOXEL, unpacked(opened))["_seen"].any(1)
+    assert np.array_equal(volume.places, opened[said]) and len(volume.places) > 5
+    assert np.isin(opened, changed).all()
+    for name, expected in by_hand(view, pose, VOXEL, unpacked(volume.places)).items():
+        off = np.abs(sums(volume)[name] - expected)
+        assert off.max() <= (1 if name != "_distance" else 4 * FULL) and (off > 0).mean() < 2e-3, name
+    signs = np.packbits(sums(volume)["_weight"] > 0, axis=1, bitorder="little")
+    assert np.array_equal(sums(volume)["_known"], signs)
+
+
+def test_sums_of_two_views_are_the_sums_of_their_sums_and_one_taken_out_leaves_the_other():
+    both = fused()
+    parts = [TsdfVolume(VOXEL, FusionConfig()) for _ in looks()]
+    for part, look in zip(parts, looks(), strict=True):
+        part.integrate(*look)
+    together: dict[str, dict[int, np.ndarray]] = {"_weight": {}, "_distance": {}, "_seen": {}, "_color": {}}
+    for part in parts:
+        for name, values in together.items():
+            for code, value in zip(part.places.tolist(), sums(part)[name], strict=True):
+                values[code] = values.get(code, 0) + value
+    for name, values in together.items():
+        assert np.array_equal(sums(both)[name], [values[code] for code in both.places.tolist()]), name
+    both.remove(*looks()[0])
+    assert np.array_equal(both.places, parts[1].places) and both.views == 1
+    assert all(np.array_equal(sums(both)[name], sums(parts[1])[name]) for name in together)
+    both.remove(*looks()[1])
+    assert both.views == len(both.places) == 0 and len(both.extract_mesh().vertices) == 0
+
+
+def test_a_voxel_is_known_once_enough_views_have_seen_it():
+    volume = fused(min_views=2)
+    held = sums(volume)
+    assert np.array_equal(held["_known"], np.packbits(held["_seen"] >= 2, axis=1, bitorder="little"))
+    assert 0 < (held["_seen"] >= 2).sum() < (held["_seen"] >= 1).sum()
+
+
+def test_a_volume_that_outgrows_its_memory_keeps_what_it_holds_and_who_is_beside_whom():
+    volume, places = TsdfVolume(VOXEL), np.stack(np.meshgrid(*[np.arange(-4, 4)] * 3), -1).reshape(-1, 3)
+    codes = np.random.default_rng(0).permutation(packed(places))
+    first = volume._hold(codes[:200])
+    volume._weight[first] = np.arange(200)[:, None]
+    volume._release(volume._hold(codes[100:120]))
+    slots = volume._hold(codes)
+    kept = np.r_[0:100, 120:200]
+    assert np.array_equal(slots[kept], first[kept]) and np.array_equal(volume._weight[slots[kept], 7], kept)
+    assert len(np.unique(slots)) == 512 and np.array_equal(volume._codes[slots], codes) and (slots >= 0).all()
+    assert np.array_equal(volume.places, np.sort(codes)) and np.array_equal(volume.slots(codes), slots)
+    volume._release(volume.slots(codes[:64]))
+    left = volume.places
+    assert np.array_equal(left, np.sort(codes[64:])) and (volume.slots(codes[:64]) == -1).all()
+    at = volume.slots(left)
+    for corner, step in enumerate(CORNERS):
+        assert np.array_equal(volume._above[at, corner], volume.slots(packed(unpacked(left) + step)))
+        assert np.array_equal(volume._below[at, corner], volume.slots(packed(unpacked(left) - step)))
+
+
+# The surface
+
+
+def test_vertices_lie_on_the_wall_with_the_colours_weights_and_views_of_the_voxels_beside_them():
+    volume = fused(1)
+    mesh = volume.extract_mesh()
+    off = mesh.vertices @ np.array([0.25, -0.35, 0.9]) - 2.0
+    assert len(mesh.vertices) > 50 and np.abs(off).max() < 0.02 * VOXEL and mesh.views.tolist() == [1] * len(off)
+    found, weight = volume.cut(volume.slots(volume.places)), volume._weight.reshape(-1)
+    order = np.argsort(found.names)
+    names, first = np.unique(found.names, return_index=True)
+    assert len(names) == len(mesh.vertices) and len(order) > len(first)
+    near, far, share = found.near[first], found.far[first], found.share[first]
+    np.testing.assert_allclose(mesh.weights, (weight[near] * (1 - share) + weight[far] * share) / 255)
+    color = volume._color.reshape(-1, 4) * 1.0
+    mean = color[near] * (1 - share)[:, None] + color[far] * share[:, None]
+    np.testing.assert_allclose(mesh.colors, mean[:, :3] / mean[:, 3:] / 255, atol=1e-6)
+    assert mesh.colors.min() > 0.05 and mesh.colors.max() < 0.95
+
+
+def test_patches_hold_the_mesh_whatever_was_renewed_before():
+    volume, surface = TsdfVolume(VOXEL, FusionConfig()), BlockSurface()
+    for view, pose in looks():
+        surface.renew(volume, volume.integrate(view, pose))
+    vertices, triangles, colors = joined(surface.patches.values())
+    mesh = volume.extract_mesh()
+    order, other = np.lexsort(vertices.round(5).T), np.lexsort(mesh.vertices.round(5).T)
+    np.testing.assert_allclose(vertices[order], mesh.vertices[other], atol=1e-5)
+    np.testing.assert_allclose(colors[order], mesh.colors[other], atol=0.51 / 255)
+    ranks, others = np.argsort(order), np.argsort(other)
+    assert {tuple(t) for t in ranks[triangles].tolist()} == {tuple(t) for t in others[mesh.triangles].tolist()}
+    assert np.array_equal(np.sort(surface.places), [c for c in volume.places if c in surface.patches])
+    for view, pose in looks():
+        surface.renew(volume, volume.remove(view, pose))
+    assert not surface.patches
+
+
+def test_no_patches_together_are_an_empty_mesh():
+    vertices, triangles, colors = joined([])
+    assert vertices.shape == triangles.shape == colors.shape == (0, 3) and triangles.dtype.kind == "i"
+
+
+# Views
+
+
+def planes_by_hand(distance: np.ndarray, valid: np.ndarray, camera: Pinhole, max_slope: float = 10.0):
+    """Normals (H, W, 3) away from the camera, and which pixels are beside an edge: by differences to both sides."""
+    rays = camera.rays()[0]
+    points, shape = rays * distance[..., None], distance.shape
+    normals, edge = np.zeros(points.shape), np.zeros(shape, bool)
+    for row, column in np.ndindex(*shape):
+        along = []
+        for step in ((0, 1), (1, 0)):
+            total = np.zeros(3)
+            for way in (-1, 1):
+                r, c = row + way * step[0], column + way * step[1]
+                if not (0 <= r < shape[0] and 0 <= c < shape[1] and valid[r, c]):
+                    continue
+                gap = np.linalg.norm(rays[r, c] - rays[row, column])
+                least = min(distance[r, c], distance[row, column])
+                if abs(distance[r, c] - distance[row, column]) > max_slope * gap * least:
+                    edge[row, column] = True
+                else:
+                    total += way * (points[r, c] - points[row, column])
+            along.append(total)
+        normal = np.cross(*along)
+        size = np.linalg.norm(normal)
+        normals[row, column] = normal / size if size > 0 else rays[row, column]
+    return normals, edge
+
+
+def bumpy(camera: Pinhole = CAMERA) -> tuple[np.ndarray, np.ndarray]:
+    """A wavy wall with a step in it, (H, W), and which of its pixels are known: at some, none beside them is."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    distance = 3 + 0.2 * np.sin(u) + 0.15 * np.cos(1.3 * v) + 6.0 * (u > 9)
+    valid = np.random.default_rng(5).random(distance.shape) < 0.85
+    valid[0, :4], valid[1, :4], valid[0, 1] = False, False, True
+    return distance, valid
+
+
+@pytest.mark.parametrize("way_round", [False, True])
+def test_the_plane_of_a_pixel_is_that_through_it_and_its_neighbours_and_weighs_its_slant(way_round):
+    distance, valid = bumpy()
+    image, camera = colours(), CAMERA
+    if way_round:  # rows for columns
+        distance, valid, image = distance.T, valid.T, image.transpose(1, 0, 2)
+        camera = Pinhole(11, 14, 15.0, 14.0, 5.9, 6.2)
+    view = surface_view(predicted(distance, valid, camera), image, RectifyConfig())
+    normals, edge = planes_by_hand(distance, valid, camera)
+    rays, known = camera.rays()[0], valid & ~edge
+    shape = distance.shape
+    planes = view.planes[:-1].reshape(*shape, 4)
+    assert 20 < known.sum() < valid.sum() and (edge & valid).any()
+    np.testing.assert_allclose(planes[known][:, :3], normals[known], atol=2e-3)
+    through = (normals * rays).sum(-1) * distance
+    np.testing.assert_allclose(planes[known][:, 3], through[known], rtol=2e-3)
+    weight = np.clip(np.rint(255 * (normals * rays).sum(-1)), 1, 255) * known
+    assert np.abs(view.weights[:-1].reshape(shape).astype(int) - weight).max() <= 1
+    assert np.array_equal(view.weights[:-1].reshape(shape) > 0, known)
+    np.testing.assert_allclose(view.colors[:-1, :3].reshape(*shape, 3), image * 255, atol=0.51)
+    np.testing.assert_allclose(
+        view.points[:, :-1].T.reshape(*shape, 3)[known], (rays * distance[..., None])[known], rtol=1e-5
+    )
+    assert (view.colors[:, 3] == 1).all() and not view.weights[-1] and not view.planes[-1].any()
+
+
+def test_a_finer_image_is_averaged_in_whole_squares_over_what_is_known():
+    """Of 5 x 4 pixels at twice the resolution that is fused: the last column of squares is half a square wide."""
+    camera = Pinhole(5, 4, 30.0, 30.0, 2.4, 2.1)
+    rng = np.random.default_rng(0)
+    distance, image = 3 + 0.01 * rng.random((4, 5)), rng.uniform(0.2, 0.8, (4, 5, 3)).astype(np.float32)
+    valid = np.ones((4, 5), bool)
+    valid[0, 0] = valid[2:, 4] = False
+    view = surface_view(predicted(distance, valid, camera), image, RectifyConfig(focal_px=15.0))
+    points = camera.rays()[0] * distance[..., None]
+    for k, (rows, columns) in enumerate(
+        (np.s_[2 * r : 2 * r + 2], np.s_[2 * c : 2 * c + 2]) for r, c in np.ndindex(2, 3)
+    ):
+        part = valid[rows, columns]
+        if not part.any():
+            assert view.weights[k] == 0
+            continue
+        np.testing.assert_allclose(view.points[:, k], points[rows, columns][part].mean(0), rtol=1e-5)
+        np.testing.assert_allclose(view.colors[k, :3], 255 * image[rows, columns][part].mean(0), atol=0.51)
+        assert view.weights[k] > 200
+    assert len(view.weights) == 7
+
+
+def test_directions_find_the_pixel_that_they_fall_into_and_none_outside_the_image():
+    view = looks()[0][0]
+    u, v = np.meshgrid((np.arange(14 * 4) + 0.5) / 4, (np.arange(11 * 4) + 0.5) / 4)
+    places = np.stack([u, v], -1).reshape(-1, 2)
+    inner = (np.abs(places - places.round()) > 0.2).all(1)  # not within a cell of the next pixel
+    rays = CAMERA.unproject(places)[0].astype(np.float32)
+    found = view.table.look_up(rays * np.float32(0.3), np.zeros((3, 1), np.float32))[:, 0]
+    expected = places[:, 1].astype(int) * 14 + places[:, 0].astype(int)
+    assert (found[inner] == expected[inner]).mean() > 0.97 and inner.sum() > 200
+    outside = CAMERA.unproject(np.array([[-1.0, 5], [15, 5], [7, -1], [7, 12], [-40, 5], [7, 60]]))[0]
+    away = np.concatenate([outside, -rays[:4], [[0, 0, -1.0], [1, 0, 0], [0, -1, 0]]]).astype(np.float32)
+    lost = view.table.look_up(away[:, :] * np.float32(7), np.zeros((3, 1), np.float32))
+    assert (lost == view.table.outside).all() and view.table.outside == 14 * 11
