@@ -197,6 +197,8 @@ def test_the_median_of_the_ratios_is_taken_as_it_is_and_wrong_points_pull_it():
     lmeds = align("1", pairs, AlignmentConfig())
     assert found.scale == np.median(pairs.mapped / pairs.predicted)
     assert found.scale > lmeds.scale * 1.005 and found.sigma > lmeds.sigma
+    residual = np.abs(pairs.mapped - found.scale * pairs.predicted)
+    assert found.sigma == pytest.approx(1.4826 * np.median(residual))
     with refused(where="alignment.estimator", found="'mean'"):
         AlignmentConfig(estimator="mean")
 
@@ -226,3 +228,7 @@ def test_exactly_as_many_inliers_as_wanted_are_enough():
 def test_two_bundles_of_rays_spread_by_their_angle_to_the_middle():
     angle = np.radians([0.0, 0.0, 10.0, -10.0])
     assert spread_deg(np.stack([np.sin(angle), 0 * angle, np.cos(angle)], 1)) == pytest.approx(np.sqrt(50))
+
+
+def test_rays_that_cancel_out_spread_by_a_right_angle():
+    assert spread_deg(np.array([[0, 0, 1.0], [0, 0, -1.0]])) == pytest.approx(90)

@@ -71,3 +71,12 @@ def test_invalid_pixels_do_not_matter():
 def test_bendings_that_are_none_are_refused(changes, what):
     with refused(what):
         BendingConfig(**changes)
+
+
+@pytest.mark.parametrize("n", [2, 5])
+def test_no_bump_moves_the_mean_of_the_field(n):
+    config = BendingConfig(grids=(n,), slope_deviation=0.0)
+    flat = np.zeros((320, 400))
+    for weights in np.eye(1 + n * n)[1:]:
+        field = Bend(config, 0.0, weights, (400, 320)).field(flat)
+        assert abs(field.mean()) < 1e-4 and 0.4 < np.ptp(field) < 1.1

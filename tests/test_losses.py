@@ -457,3 +457,12 @@ def test_the_indirect_light_of_a_large_image_is_that_of_a_small_one():
 
     assert torch.allclose(light(384).log(), light(128).log(), atol=0.03)
     assert not torch.allclose(light(384).log(), light(32).log(), atol=0.03)
+
+
+def test_what_is_rendered_brighter_than_white_counts_as_white_in_ssim():
+    image = torch.rand(1, 3, 12, 12, generator=torch.Generator().manual_seed(0))
+    usable = torch.ones(1, 1, 12, 12, dtype=torch.bool)
+    rendered = (image * 1.5 - 0.2).clamp(0, 1)
+    beyond = torch.where(rendered == 1, 1.7, torch.where(rendered == 0, -0.4, rendered))
+    assert (rendered == 1).any() and (rendered == 0).any()
+    torch.testing.assert_close(ssim_loss(image, beyond, usable), ssim_loss(image, rendered, usable))

@@ -6,31 +6,33 @@ from functools import cache
 
 import numpy as np
 import pytest
+from raising import refused
 from test_fusion import by_hand, shifted, sums
 
-from densify.fusion.marching_cubes import CORNERS, packed, unpacked
+from densify.fusion.marching_cubes import CORNERS, REACH, packed, unpacked
 from densify.fusion.patches import BlockSurface, joined
 from densify.fusion.rectify import FULL, RectifyConfig, SurfaceView, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
-from lightdepth.camera import Pinhole
+from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole
 from lightdepth.prediction import DepthPrediction
+from lightdepth.sparse_map import Keyframe, Submap, typical_distance
 
 CAMERA = Pinhole(14, 11, 14.0, 15.0, 6.2, 5.9)
 VOXEL = 0.16
 
 
-def predicted(distance: np.ndarray, valid: np.ndarray | None = None, camera: Pinhole = CAMERA) -> DepthPrediction:
+def predicted(distance: np.ndarray, valid: np.ndarray | None = None, camera: CameraModel = CAMERA) -> DepthPrediction:
     known = np.ones(distance.shape, bool) if valid is None else valid
     return DepthPrediction("1", distance.astype(np.float32), known, camera, "closed form")
 
 
-def slanted(camera: Pinhole = CAMERA) -> np.ndarray:
+def slanted(camera: CameraModel = CAMERA) -> np.ndarray:
     """The distance (H, W) to a plane that is seen at a slant."""
     found: np.ndarray = 2.0 / (camera.rays()[0] @ np.array([0.25, -0.35, 0.9]))
     return found
 
 
-def colours(camera: Pinhole = CAMERA) -> np.ndarray:
+def colours(camera: CameraModel = CAMERA) -> np.ndarray:
     return np.random.default_rng(3).uniform(0.1, 0.9, (camera.height, camera.width, 3)).astype(np.float32)
 
 
@@ -132,6 +134,37 @@ def test_a_volume_that_outgrows_its_memory_keeps_what_it_holds_and_who_is_beside
         assert np.array_equal(volume._below[at, corner], volume.slots(packed(unpacked(left) - step)))
 
 
+def test_a_view_that_knows_nothing_changes_nothing_and_no_volume_is_too_fine():
+    volume, blind = (
+        TsdfVolume(VOXEL),
+        surface_view(predicted(slanted(), np.zeros((11, 14), bool)), colours(), RectifyConfig()),
+    )
+    assert volume.integrate(blind, np.eye(4)).shape == (0,) and volume.views == 0
+    assert volume._touched(blind, np.eye(4)).shape == (0, 3) and not len(volume.places)
+    mesh = volume.extract_mesh()
+    assert mesh.vertices.shape == mesh.triangles.shape == (0, 3)
+    for voxel in (0.0, -1.0, np.nan, np.inf):
+        with refused(where="voxel size", found=f"{voxel}"):
+            TsdfVolume(voxel)
+    view = looks()[0][0]
+    with refused(where="voxel size", found="blocks of 8 voxels"):
+        TsdfVolume(0.0003).integrate(view, np.eye(4))
+    far = shifted(VOXEL * (REACH - 10))
+    with refused(where="voxel size", found="voxels from the map's origin"):
+        TsdfVolume(VOXEL).integrate(view, far)
+    assert len(TsdfVolume(VOXEL).integrate(view, shifted(VOXEL * (REACH - 400))))
+
+
+def test_a_voxel_s_size_is_the_one_given_or_a_share_of_the_submap_s_typical_distance():
+    points = np.array([[0, 0, 5.0], [0, 1, 7], [1, 0, 9]])
+    keyframe = Keyframe("000001.png", CAMERA, np.eye(4), np.full((3, 2), 5.0), np.arange(3))
+    submap = Submap(0, (keyframe,), np.arange(3), points)
+    typical = typical_distance(submap)
+    assert FusionConfig().voxel_for(submap) == pytest.approx(typical / 52) and 5 < typical < 9.2
+    assert FusionConfig(voxels_per_distance=10).voxel_for(submap) == pytest.approx(typical / 10)
+    assert FusionConfig(voxel=0.5).voxel_for(submap) == 0.5
+
+
 # The surface
 
 
@@ -177,7 +210,7 @@ def test_no_patches_together_are_an_empty_mesh():
 # Views
 
 
-def planes_by_hand(distance: np.ndarray, valid: np.ndarray, camera: Pinhole, max_slope: float = 10.0):
+def planes_by_hand(distance: np.ndarray, valid: np.ndarray, camera: CameraModel, max_slope: float = 10.0):
     """Normals (H, W, 3) away from the camera, and which pixels are beside an edge: by differences to both sides."""
     rays = camera.rays()[0]
     points, shape = rays * distance[..., None], distance.shape
@@ -203,7 +236,7 @@ def planes_by_hand(distance: np.ndarray, valid: np.ndarray, camera: Pinhole, max
     return normals, edge
 
 
-def bumpy(camera: Pinhole = CAMERA) -> tuple[np.ndarray, np.ndarray]:
+def bumpy(camera: CameraModel = CAMERA) -> tuple[np.ndarray, np.ndarray]:
     """A wavy wall with a step in it, (H, W), and which of its pixels are known: at some, none beside them is."""
     v, u = np.mgrid[: camera.height, : camera.width]
     distance = 3 + 0.2 * np.sin(u) + 0.15 * np.cos(1.3 * v) + 6.0 * (u > 9)
@@ -273,3 +306,27 @@ def test_directions_find_the_pixel_that_they_fall_into_and_none_outside_the_imag
     away = np.concatenate([outside, -rays[:4], [[0, 0, -1.0], [1, 0, 0], [0, -1, 0]]]).astype(np.float32)
     lost = view.table.look_up(away[:, :] * np.float32(7), np.zeros((3, 1), np.float32))
     assert (lost == view.table.outside).all() and view.table.outside == 14 * 11
+
+
+def test_cells_of_directions_are_six_tenths_of_the_least_way_between_pixels():
+    table = looks()[0][0].table
+    rays = CAMERA.rays()[0]
+    place = rays[..., :2] / (1 + rays[..., 2:])
+    ways = [np.linalg.norm(np.diff(place, axis=axis), axis=-1).min() for axis in (0, 1)]
+    assert 0.57 < 1 / table.scale / min(ways) < 0.6
+    assert (
+        np.abs(place).max() + 0.4 * min(ways) < len(table.cells) / table.scale / 2 < np.abs(place).max() + 2 * max(ways)
+    )
+
+
+def test_of_a_fisheye_a_pinhole_field_keeps_what_an_undistorted_image_of_its_size_would_hold():
+    fisheye = KannalaBrandt(30, 22, 12.0, 12.5, 16.0, 10.0, 0.01, 0.0, 0.0, 0.0)
+    rays = fisheye.rays()[0]
+    place = np.sqrt(12 * 12.5) * rays[..., :2] / rays[..., 2:] + (16, 10)
+    kept = (rays[..., 2] > 0) & (place >= 0).all(-1) & (place[..., 0] <= 30) & (place[..., 1] <= 22)
+    distance, config = np.full((22, 30), 3.0), RectifyConfig(field="pinhole", max_slope=100)
+    view = surface_view(predicted(distance, fisheye.rays()[1], fisheye), colours(fisheye), config)
+    assert np.array_equal(view.weights[:-1].reshape(22, 30) > 0, kept) and 50 < kept.sum() < 600
+    assert (surface_view(predicted(slanted()), colours(), RectifyConfig(field="pinhole")).weights[:-1] > 0).all()
+    with refused(where="field"):
+        RectifyConfig(field="fisheye")
