@@ -28,7 +28,8 @@ from lightdepth.datasets.c3vd import C3VD_V2
 STRONG = Brown(640, 480, 400.0, 408.0, 328.0, 236.8, -0.5, 0.12, 0.02, -0.015)
 K3 = FullBrown(640, 480, 520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172, 0.0, 0.0, 0.0)
 RATIONAL = FullBrown(640, 480, 400.0, 410.0, 322.0, 238.0, 0.3, 0.1, 0.001, 5e-4, 0.02, 0.5, 0.2, 0.01)
-ALL = {**LENSES, "c3vd v2": C3VD_V2, "strong brown": STRONG, "k3": K3, "rational": RATIONAL}
+WAVY = KannalaBrandt(320, 240, 130.0, 133.0, 162.0, 118.0, 0.05, -0.03, 0.02, 0.03)
+ALL = {**LENSES, "wavy fisheye": WAVY, "c3vd v2": C3VD_V2, "strong brown": STRONG, "k3": K3, "rational": RATIONAL}
 VARIANTS = {
     "as published": lambda camera: camera,
     "resized": lambda camera: camera.resized(camera.width // 5, camera.height // 5),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,7 +12,7 @@ from test_fusion import by_hand, shifted, sums
 
 from densify.fusion.marching_cubes import CORNERS, REACH, packed, unpacked
 from densify.fusion.patches import BlockSurface, joined
-from densify.fusion.rectify import FULL, RectifyConfig, SurfaceView, surface_view
+from densify.fusion.rectify import FULL, RectifyConfig, SurfaceView, _lens, _table, light_weight, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole
 from lightdepth.prediction import DepthPrediction
@@ -187,6 +188,7 @@ def test_vertices_lie_on_the_wall_with_the_colours_weights_and_views_of_the_voxe
 
 def test_patches_hold_the_mesh_whatever_was_renewed_before():
     volume, surface = TsdfVolume(VOXEL, FusionConfig()), BlockSurface()
+    assert not len(surface.renewed) and not len(surface.places)
     for view, pose in looks():
         surface.renew(volume, volume.integrate(view, pose))
     vertices, triangles, colors = joined(surface.patches.values())
@@ -308,6 +310,38 @@ def test_directions_find_the_pixel_that_they_fall_into_and_none_outside_the_imag
     assert (lost == view.table.outside).all() and view.table.outside == 14 * 11
 
 
+WIDE = KannalaBrandt(31, 23, 9.0, 9.5, 15.2, 11.8, 0.02, -0.01, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("merged", [1, 3])
+@pytest.mark.parametrize("camera", [CAMERA, WIDE, WIDE.cropped(9, 7, 20, 14)])
+def test_every_cell_of_the_table_has_the_pixel_that_its_middle_is_seen_in(camera, merged):
+    table = _table(camera, merged)
+    size = len(table.cells)
+    width, height = -(-camera.width // merged), -(-camera.height // merged)
+    place = (np.arange(size) + 0.5 - size / 2) / table.scale
+    p, q = np.meshgrid(place, place)
+    pixels, seen = camera.project(np.stack([2 * p, 2 * q, 1 - p * p - q * q], -1))
+    column, row = np.minimum(pixels // merged, (width - 1, height - 1)).astype(int).transpose(2, 0, 1)
+    expected = np.where(seen, row * width + column, width * height)
+    assert table.outside == width * height and size % 4 == 0 and table.cells.max() == table.outside
+    assert ((table.cells == table.outside) == ~seen).all()
+    assert (table.cells == expected).mean() > 0.99
+    assert len(np.unique(table.cells[seen])) >= 0.95 * len(np.unique(expected[seen]))
+    border = np.concatenate([seen[[0, -1]].ravel(), seen[:, [0, -1]].ravel()])
+    assert not border.any()
+
+
+@pytest.mark.parametrize("camera", [CAMERA, WIDE])
+def test_a_lens_on_merged_pixels_has_their_rays_and_the_angles_between_them(camera):
+    lens = _lens(camera, 2)
+    u, v = np.meshgrid(np.arange(1, camera.width + 1, 2), np.arange(1, camera.height + 1, 2))
+    rays = camera.unproject(np.stack([u, v], -1) * 1.0)[0]
+    np.testing.assert_allclose(lens.rays, np.moveaxis(rays, -1, 0), atol=1e-6)
+    for found, axis in zip(lens.gaps, (1, 0), strict=True):
+        np.testing.assert_allclose(found, np.linalg.norm(np.diff(rays, axis=axis), axis=-1), atol=1e-6)
+
+
 def test_cells_of_directions_are_six_tenths_of_the_least_way_between_pixels():
     table = looks()[0][0].table
     rays = CAMERA.rays()[0]
@@ -330,3 +364,26 @@ def test_of_a_fisheye_a_pinhole_field_keeps_what_an_undistorted_image_of_its_siz
     assert (surface_view(predicted(slanted()), colours(), RectifyConfig(field="pinhole")).weights[:-1] > 0).all()
     with refused(where="field"):
         RectifyConfig(field="fisheye")
+
+
+def test_dark_and_bright_pixels_weigh_less_and_unsure_ones_by_their_sigma():
+    config = RectifyConfig(dark=0.1, bright=0.8, unlit=0.4, sigma=0.2)
+    value = np.array([0.0, 0.05, 0.1, 0.5, 0.8, 0.9, 1.0, 1.3])
+    np.testing.assert_allclose(light_weight(value, config), [0.4, 0.7, 1, 1, 1, 0.7, 0.4, 0.4])
+    image = np.full((11, 14, 3), 0.2, np.float32)
+    image[:, 7:, 1] = 0.9  # the brightest channel counts
+    sigma = np.full((11, 14), 0.2, np.float32)
+    sigma[6:] = 0.0
+    facing = 2.0 / CAMERA.rays()[0][..., 2]
+    weights = surface_view(replace(predicted(facing), uncertainty=sigma), image, config).weights[:-1].reshape(11, 14)
+    lit = np.where(np.arange(14) < 7, 1.0, 0.7) / np.where(np.arange(11) < 6, 2.0, 1.0)[:, None]
+    np.testing.assert_allclose(weights, 255 * lit * CAMERA.rays()[0][..., 2], atol=1.01)
+
+
+def test_beyond_the_given_distance_nothing_is_known_but_bends_the_planes_beside_it_as_it_should():
+    facing = 2.0 / CAMERA.rays()[0][..., 2]
+    whole = surface_view(predicted(facing), colours(), RectifyConfig())
+    near = surface_view(predicted(facing), colours(), RectifyConfig(), 2.1)
+    known = facing.ravel().astype(np.float32) <= 2.1
+    assert 20 < known.sum() < 150 and np.array_equal(near.weights[:-1] > 0, known)
+    np.testing.assert_array_equal(near.planes[:-1][known], whole.planes[:-1][known])

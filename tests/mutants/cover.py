@@ -34,11 +34,11 @@ class Cover:
 
     def of(self, path: Path, first: int, last: int) -> list[str]:
         """The tests of some lines, the quickest first. Lines that run at import are covered by whatever runs a line of
-        the module."""
+        the module, and by the test files that name it."""
         lines = self.lines.get(str(path.relative_to(ROOT)), {})
         found: set[str] = set().union(*(lines.get(n, set()) for n in range(first, last + 1)))
         if not found and _at_import(path, first):
-            found = set().union(*lines.values())
+            found = set().union(*lines.values()) | {t for t in self.seconds if _names(ROOT / t.split("::")[0], path)}
         return sorted(found, key=lambda t: (self.seconds[t], t))
 
 
@@ -53,6 +53,13 @@ def _inside(path: Path) -> list[tuple[int, int]]:
 
 def _at_import(path: Path, line: int) -> bool:
     return not any(first <= line <= last for first, last in _inside(path))
+
+
+@functools.cache
+def _names(test: Path, module: Path) -> bool:
+    parts = module.relative_to(ROOT).with_suffix("").parts
+    text = test.read_text(encoding="utf-8")
+    return any(f"from {'.'.join(names)} import" in text for names in (parts, parts[:-1]))
 
 
 def measured(files: list[Path], modules: list[Path], kept: Path) -> Cover:

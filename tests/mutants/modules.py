@@ -24,7 +24,8 @@ _FILES = {
 }
 
 TEST_FILES = """
-    camera camera_conversion lenses calibration_formats geometry photometry robust radiosity losses decline frame
+    camera foreign_bends camera_conversion lenses calibration_formats defaults geometry photometry
+    robust radiosity losses decline frame
     alignment agreement agreement_mutants bending metrics refine relative_pose observations prediction trajectory
     marching_cubes tiny_fusion second_core compiled plain_fusion
 """
