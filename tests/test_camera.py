@@ -412,3 +412,14 @@ def test_the_longer_form_of_brown_folds_where_brown_does(camera):
     (pixels, seen), (others, also) = camera.project(points[~close]), longer.project(points[~close])
     assert np.array_equal(seen, also) and 50 < seen.sum() < 450
     np.testing.assert_allclose(pixels[seen], others[seen])
+
+
+def test_the_smallest_image_has_one_pixel_and_one_ray():
+    rays, valid = Pinhole(1, 1, 2.0, 4.0, 0.5, 0.5).rays()
+    assert rays.tolist() == [[[0, 0, 1]]] and valid.all()
+    for size in ((0, 1), (1, 0)):
+        with refused(where="camera size"):
+            Pinhole(*size, 2.0, 4.0, 0.5, 0.5)
+    for focal in ((0.0, 1.0), (1.0, 0.0)):
+        with refused(where="PINHOLE camera", found="focal lengths"):
+            Pinhole(1, 1, *focal, 0.5, 0.5)

@@ -32,6 +32,7 @@ from lightdepth.losses import (
     training_loss,
     uncertainty_loss,
 )
+from lightdepth.losses.config import TERMS
 from lightdepth.photometry import LightTerms, PhotometricCalibration, bent, encode, hue_saturation_albedo
 
 LAMBERT = LossConfig(cosine_exponent=1.0, reflectance=0.0, cosine_floor=0.0)
@@ -466,3 +467,28 @@ def test_what_is_rendered_brighter_than_white_counts_as_white_in_ssim():
     beyond = torch.where(rendered == 1, 1.7, torch.where(rendered == 0, -0.4, rendered))
     assert (rendered == 1).any() and (rendered == 0).any()
     torch.testing.assert_close(ssim_loss(image, beyond, usable), ssim_loss(image, rendered, usable))
+
+
+@pytest.mark.parametrize("name", ["ssim", "specular", "albedo"])
+def test_a_term_is_taken_where_it_has_a_weight_and_the_total_is_their_weighted_sum(name):
+    batch, albedo = tube_batch()
+    config = replace(LAMBERT, **{name: 0.7})
+    total, terms = self_supervised_loss(spoilt(batch.true_distance), albedo, batch, config)
+    always = {"photometric", "saturated", "facing", "smoothness", "chroma"}
+    assert set(terms) == always | {name}
+    torch.testing.assert_close(total, sum(getattr(config, term) * value for term, value in terms.items()))
+    assert set(self_supervised_loss(batch.true_distance, None, batch, LAMBERT)[1]) == always - {"chroma"}
+
+
+@pytest.mark.parametrize("name", [*TERMS, "self_supervised", "supervised", "uncertainty", "huber", "ambient"])
+def test_no_weight_is_below_zero_and_zero_is_one(name):
+    assert getattr(LossConfig(**{name: 0.0}), name) == 0
+    with refused(where="loss"):
+        LossConfig(**{name: -1e-3})
+
+
+@pytest.mark.parametrize("shoulder", [0.19, 1.01])
+def test_a_shoulder_lies_between_a_fifth_and_white(shoulder):
+    assert [LossConfig(shoulder=s).shoulder for s in (0.2, 1.0)] == [0.2, 1.0]
+    with refused(where="loss"):
+        LossConfig(shoulder=shoulder)
