@@ -366,12 +366,13 @@ def test_of_a_fisheye_a_pinhole_field_keeps_what_an_undistorted_image_of_its_siz
         RectifyConfig(field="fisheye")
 
 
-def test_dark_and_bright_pixels_weigh_less_and_unsure_ones_by_their_sigma():
+@pytest.mark.parametrize("channel", range(3))
+def test_dark_and_bright_pixels_weigh_less_and_unsure_ones_by_their_sigma(channel):
     config = RectifyConfig(dark=0.1, bright=0.8, unlit=0.4, sigma=0.2)
     value = np.array([0.0, 0.05, 0.1, 0.5, 0.8, 0.9, 1.0, 1.3])
     np.testing.assert_allclose(light_weight(value, config), [0.4, 0.7, 1, 1, 1, 0.7, 0.4, 0.4])
     image = np.full((11, 14, 3), 0.2, np.float32)
-    image[:, 7:, 1] = 0.9  # the brightest channel counts
+    image[:, 7:, channel] = 0.9  # the brightest channel counts
     sigma = np.full((11, 14), 0.2, np.float32)
     sigma[6:] = 0.0
     facing = 2.0 / CAMERA.rays()[0][..., 2]
