@@ -325,3 +325,10 @@ def test_a_lens_of_nearly_our_longest_polynomial_becomes_that_and_is_off_by_what
     rays = rays_of(camera)
     assert 0 < off(camera, lens.pixels(rays), rays) < 0.1
     np.testing.assert_allclose(camera.params[:5], (420, 410, 322, 238, -0.3), rtol=0.01)
+
+
+def test_a_lens_is_sampled_to_the_corners_of_its_image():
+    lens = ForeignLens("straight", 640, 480, (410.0, 410.0, 300.0, 260.0), opencv_bend(()))
+    _, pixels, _ = _samples(lens, "here")
+    for corner in ((0, 0), (640, 0), (0, 480), (640, 480)):
+        assert np.linalg.norm(pixels - corner, axis=1).min() < 4

@@ -9,6 +9,7 @@ from lightdepth.frame import FrameBatch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.losses import (
     LossConfig,
+    Seen,
     albedo_loss,
     brightness_residual,
     chroma_loss,
@@ -492,3 +493,17 @@ def test_a_shoulder_lies_between_a_fifth_and_white(shoulder):
     assert [LossConfig(shoulder=s).shoulder for s in (0.2, 1.0)] == [0.2, 1.0]
     with refused(where="loss"):
         LossConfig(shoulder=shoulder)
+
+
+def test_white_pixels_and_black_ones_tell_nothing_of_distance_and_only_white_ones_in_the_mask_are_saturated():
+    batch, _ = tube_batch()
+    image, mask = batch.image.clone(), batch.mask.clone()
+    image[..., :4, :], image[..., 4:8, :], mask[..., 2:6, :] = 1.0, 0.0, False
+    image[:, 0, 8:10] = 0.971
+    seen = Seen.of(batch._replace(image=image, mask=mask), LAMBERT)
+    white = torch.zeros_like(mask)
+    white[..., :2, :], white[..., 8:10, :] = True, True
+    assert torch.equal(seen.saturated, white)
+    assert not (seen.usable & (white | ~mask)).any() and not seen.usable[..., :8, :].any()
+    assert seen.usable[..., 14:, :].float().mean() > 0.9
+    torch.testing.assert_close(seen.log_v.exp(), image.amax(1, keepdim=True).clamp(min=0.01))
