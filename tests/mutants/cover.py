@@ -59,7 +59,7 @@ def _at_import(path: Path, line: int) -> bool:
 def _names(test: Path, module: Path) -> bool:
     parts = module.relative_to(ROOT).with_suffix("").parts
     text = test.read_text(encoding="utf-8")
-    return any(f"from {'.'.join(names)} import" in text for names in (parts, parts[:-1]))
+    return ".".join(parts) in text or f"from {'.'.join(parts[:-1])} import" in text
 
 
 def measured(files: list[Path], modules: list[Path], kept: Path) -> Cover:
