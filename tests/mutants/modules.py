@@ -27,7 +27,8 @@ TEST_FILES = """
     camera foreign_bends camera_conversion lenses calibration_formats defaults geometry photometry
     robust radiosity losses decline frame
     alignment agreement agreement_mutants agreement_parts bending metrics refine relative_pose observations
-    prediction trajectory marching_cubes tiny_fusion tiny_views trajectory_paths frozen second_core compiled plain_fusion
+    prediction trajectory marching_cubes tiny_fusion tiny_views trajectory_paths frozen second_core compiled
+    plain_fusion losses_by_hand
 """
 
 
