@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_fusion import shifted
-from test_tiny_fusion import VOXEL, fused, looks
+from test_tiny_fusion import VOXEL, fused, looks, predicted
 
 from densify.fusion.marching_cubes import REACH, one_vertex_an_edge, packed, unpacked
 from densify.fusion.patches import BlockSurface, joined
+from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
+from lightdepth.camera import Pinhole
 
 
 def test_a_direction_is_that_of_the_sum_of_its_two_parts():
@@ -75,3 +79,38 @@ def test_the_truncation_is_how_far_behind_the_wall_a_voxel_is_known(truncation):
     share = volume._distance[slots][known] / volume._weight[slots][known] / 2048
     expected = np.clip(-behind[known] / size / (truncation * VOXEL), -1, 1)
     assert np.abs(share - expected).max() < 2e-3
+
+
+def test_a_square_with_a_step_inside_is_left_out_and_light_and_doubt_are_averaged():
+    """Of 2 x 2 pixels, at twice the resolution that is fused: a step of a tenth is still a slope, one to double is an
+    edge."""
+    camera = Pinhole(12, 8, 30.0, 30.0, 6.0, 4.0)
+    distance, image = 3 / camera.rays()[0][..., 2], np.full((8, 12, 3), 0.5, np.float32)
+    for column, step in ((2, 1.1), (8, 2.2)):
+        distance[:2, column + 1 :] *= step  # inside the square of columns 2 and 3, and of 8 and 9
+    image[4:, 0], image[4:, 1], image[6:, 4:6] = 0.0, 0.04, [[[1.0] * 3]]
+    sigma = np.zeros((8, 12), np.float32)
+    sigma[4:, 8:] = 0.3
+    sigma[4:, 9] = 0.0
+    given = replace(predicted(distance, camera=camera), uncertainty=sigma)
+    view = surface_view(given, image, RectifyConfig(focal_px=15.0, sigma=0.15))
+    weights = view.weights[:-1].reshape(4, 6)
+    lens = Pinhole(6, 4, 15.0, 15.0, 3.0, 2.0)
+    assert weights[0].tolist()[1] > 0 and weights[0, 4] == 0 and (weights[2:] > 0).all()
+    # Dark squares average .02, which is whole; white ones weigh half; doubt averages .15, which halves.
+    expected = 255 * lens.rays()[0][..., 2]
+    expected[3, 2] /= 2
+    expected[2:, 4] /= 2
+    rest = np.ones((4, 6), bool)
+    rest[:2] = False
+    rest[2:, 5] = False
+    np.testing.assert_allclose(weights[rest], expected[rest], atol=3)
+
+
+def test_a_pixel_is_as_fine_as_the_focal_length_asks_for_and_no_finer():
+    camera = Pinhole(12, 8, 30.0, 30.0, 6.0, 4.0)
+    distance = 3 / camera.rays()[0][..., 2]
+    image = np.full((8, 12, 3), 0.5, np.float32)
+    for focal, count in ((31.0, 96), (30.0, 96), (29.8, 96), (29.0, 24), (15.0, 24), (14.0, 12), (7.0, 6)):
+        view = surface_view(predicted(distance, camera=camera), image, RectifyConfig(focal_px=focal))
+        assert len(view.weights) == count + 1 == view.table.outside + 1
