@@ -8,6 +8,7 @@ import pytest
 from test_agreement import erring, errors, scene
 
 from densify.agreement import AgreementConfig, View, _overlap_rows, _pairs, _Places, _Rows, agree, gap_between
+from densify.agreement import unbent as start
 from densify.bending import Bend, BendingConfig
 from densify.contradiction import ContradictionConfig, uncontradicted
 from lightdepth.camera import Pinhole
@@ -189,3 +190,21 @@ def test_a_keyframe_that_agrees_outvotes_one_that_sees_through_and_not_five():
     middle = np.s_[20:-20, 24:-24]
     for right, wrong, kept in ((0, 1, 0.0), (1, 1, 1.0), (1, 5, 0.0)):
         assert stays([facing(0, 20.0), *nearer(right, wrong)])[0][middle].mean() == pytest.approx(kept, abs=0.1)
+
+
+# The field that a view begins with
+
+
+def test_a_view_begins_at_its_scale_about_its_middle_distance_and_bends_no_farther_than_its_points_speak():
+    keyframe, rng = keyframe_at(), np.random.default_rng(0)
+    distance = rng.uniform(10, 40, SIZE[::-1])
+    predicted = rng.uniform(10, 40, 60)
+    observed = ObservedDistances(np.arange(60), predicted * 2, predicted, np.zeros((60, 2)), np.zeros((60, 3)))
+    known = rng.random(SIZE[::-1]) < 0.7
+    view = View.of(keyframe, observed, DepthPrediction(keyframe.name, distance, known, CAMERA, "noise"), 2.0)
+    found = start(view, BendingConfig())
+    assert found.log_range == pytest.approx(np.quantile(np.log(predicted), (0.02, 0.98)))
+    assert found.log_middle == pytest.approx(np.median(view.log_distance[view.valid]))
+    assert found.scale == pytest.approx(2) and not found.weights[1:].any() and found.image_size == SIZE
+    blind = start(facing(0, 20.0), BendingConfig())
+    assert blind.log_range == (-np.inf, np.inf)

@@ -10,7 +10,7 @@ from raising import refused
 from scenes import ENDOMAPPER, cylinder
 from test_sparse_map import pose
 
-from densify.alignment import Alignment, AlignmentConfig, align, bent, spread_deg
+from densify.alignment import Alignment, AlignmentConfig, align, bent, second_mode, spread_deg
 from densify.bending import Bend, BendingConfig
 from lightdepth.observations import ObservedDistances, observed_distances
 from lightdepth.sparse_map import Keyframe, Submap
@@ -197,6 +197,8 @@ def test_the_median_of_the_ratios_is_taken_as_it_is_and_wrong_points_pull_it():
     lmeds = align("1", pairs, AlignmentConfig())
     assert found.scale == np.median(pairs.mapped / pairs.predicted)
     assert found.scale > lmeds.scale * 1.005 and found.sigma > lmeds.sigma
+    residual = np.abs(pairs.mapped - found.scale * pairs.predicted)
+    assert found.sigma == pytest.approx(1.4826 * np.median(residual))
     with refused(where="alignment.estimator", found="'mean'"):
         AlignmentConfig(estimator="mean")
 
@@ -226,3 +228,26 @@ def test_exactly_as_many_inliers_as_wanted_are_enough():
 def test_two_bundles_of_rays_spread_by_their_angle_to_the_middle():
     angle = np.radians([0.0, 0.0, 10.0, -10.0])
     assert spread_deg(np.stack([np.sin(angle), 0 * angle, np.cos(angle)], 1)) == pytest.approx(np.sqrt(50))
+
+
+def test_rays_that_cancel_out_spread_by_a_right_angle():
+    assert spread_deg(np.array([[0, 0, 1.0], [0, 0, -1.0]])) == pytest.approx(90)
+
+
+def test_a_keyframe_exactly_at_a_limit_is_trusted_and_beyond_it_is_not():
+    pairs = observed(100, wrong=0.2, noise=0.02)
+    found = align("1", pairs, AlignmentConfig())
+    inlier = np.isin(pairs.point_ids, found.inlier_ids)
+    factor, share, own = second_mode(pairs, found.scale, 2.5 * found.sigma)
+    assert found.ok and 0 < share < own and factor != 1
+    for name, value, beyond in (
+        ("min_points", 100, 101),
+        ("min_inliers", int(inlier.sum()), int(inlier.sum()) + 1),
+        ("min_inlier_share", float(inlier.mean()), float(inlier.mean()) + 1e-6),
+        ("max_relative_sigma", found.sigma / float(np.median(pairs.mapped)), found.sigma / 60),
+        ("min_spread_deg", spread_deg(pairs.rays[inlier]), spread_deg(pairs.rays[inlier]) + 1e-6),
+        ("min_distance_spread", float(np.log(pairs.mapped[inlier]).std()), 2.0),
+        ("max_second_mode", share / own * (1 + 1e-12), share / own * (1 - 1e-9)),
+    ):
+        assert align("1", pairs, AlignmentConfig(**{name: value})).ok, name
+        assert not align("1", pairs, AlignmentConfig(**{name: beyond})).ok, name

@@ -69,3 +69,28 @@ def test_invalid_pixels_do_not_matter():
 def test_bendings_that_are_none_are_refused(changes, what):
     with refused(what):
         BendingConfig(**changes)
+
+
+@pytest.mark.parametrize("n", [2, 5])
+def test_no_bump_moves_the_mean_of_the_field(n):
+    config = BendingConfig(grids=(n,), slope_deviation=0.0)
+    flat = np.zeros((320, 400))
+    for weights in np.eye(1 + n * n)[1:]:
+        field = Bend(config, 0.0, weights, (400, 320)).field(flat)
+        assert abs(field.mean()) < 1e-4 and 0.4 < np.ptp(field) < 1.1
+
+
+def test_the_prior_holds_bumps_and_slope_by_their_deviations_and_the_scale_not_at_all():
+    found = BendingConfig(grids=(2, 3), slope_deviation=0.5, bump_deviation=0.1).precision
+    np.testing.assert_allclose(found, [0, 4, *[100] * 13])
+    assert BendingConfig(grids=(2,), slope_deviation=0.0).precision.tolist() == pytest.approx([0, *[100] * 4])
+    with refused("slope_deviation -0.1"):
+        BendingConfig(slope_deviation=-0.1)
+
+
+def test_a_slope_goes_no_farther_than_points_speak():
+    bend = replace(Bend(BendingConfig(grids=()), np.log(30.0), np.array([0.1, 0.5]), SIZE), log_range=(3.0, 3.5))
+    log = np.array([[2.0, 3.0, 3.2, 3.5, 4.0]])
+    expected = 0.1 + 0.5 * (np.array([3.0, 3.0, 3.2, 3.5, 3.5]) - np.log(30.0))
+    np.testing.assert_allclose(bend.field(log.astype(np.float32))[0], expected, atol=1e-6)
+    np.testing.assert_allclose(bend.at(np.zeros((5, 2)), np.exp(log[0])), expected)

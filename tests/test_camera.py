@@ -28,7 +28,8 @@ from lightdepth.datasets.c3vd import C3VD_V2
 STRONG = Brown(640, 480, 400.0, 408.0, 328.0, 236.8, -0.5, 0.12, 0.02, -0.015)
 K3 = FullBrown(640, 480, 520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172, 0.0, 0.0, 0.0)
 RATIONAL = FullBrown(640, 480, 400.0, 410.0, 322.0, 238.0, 0.3, 0.1, 0.001, 5e-4, 0.02, 0.5, 0.2, 0.01)
-ALL = {**LENSES, "c3vd v2": C3VD_V2, "strong brown": STRONG, "k3": K3, "rational": RATIONAL}
+WAVY = KannalaBrandt(320, 240, 130.0, 133.0, 162.0, 118.0, 0.05, -0.03, 0.02, 0.03)
+ALL = {**LENSES, "wavy fisheye": WAVY, "c3vd v2": C3VD_V2, "strong brown": STRONG, "k3": K3, "rational": RATIONAL}
 VARIANTS = {
     "as published": lambda camera: camera,
     "resized": lambda camera: camera.resized(camera.width // 5, camera.height // 5),
@@ -383,3 +384,42 @@ BAD = {
 def test_a_camera_that_cannot_be_is_refused_by_name(message):
     with refused(message):
         BAD[message]()
+
+
+def test_a_twentieth_of_a_pixel_beyond_the_fold_there_is_no_ray_and_within_there_is():
+    camera = Brown(1350, 1080, 802.0, 801.0, 668.0, 547.0, -0.3, 0.0, 0.0, 0.0)
+    fold = 1 / np.sqrt(0.9)  # where r - 0.3 r^3 turns over
+    azimuth = np.linspace(0, 2 * np.pi, 100)
+    for step, valid in ((-0.05, True), (0.05, False)):
+        radius = fold - 0.3 * fold**3 + step / 802
+        pixels = np.stack([radius * np.cos(azimuth) * 802 + 668, radius * np.sin(azimuth) * 801 + 547], -1)
+        assert (camera.unproject(pixels)[1] == valid).all()
+
+
+def test_the_matrix_of_a_pinhole_projects_as_it_does():
+    point = np.array([0.3, -0.2, 2.0])
+    found = PINHOLE.matrix @ point
+    np.testing.assert_allclose(found[:2] / 2, PINHOLE.project(point)[0])
+    assert found[2] == 2 and PINHOLE.focal_length == pytest.approx(np.sqrt(500 * 505))
+
+
+@pytest.mark.parametrize("camera", [STRONG, replace(STRONG, k1=-0.3, k2=0.0), replace(BROWN, k1=-0.3, k2=0.02)])
+def test_the_longer_form_of_brown_folds_where_brown_does(camera):
+    longer = FullBrown(camera.width, camera.height, *camera.params, 0.0, 0.0, 0.0, 0.0)
+    assert longer._max_radius() == pytest.approx(camera._max_radius(), abs=1.5e-3)
+    points = np.random.default_rng(0).normal(0, 0.6, (500, 3)) + (0, 0, 1.5)
+    close = np.abs(np.hypot(points[:, 0], points[:, 1]) / points[:, 2] - camera._max_radius()) < 2e-3
+    (pixels, seen), (others, also) = camera.project(points[~close]), longer.project(points[~close])
+    assert np.array_equal(seen, also) and 50 < seen.sum() < 450
+    np.testing.assert_allclose(pixels[seen], others[seen])
+
+
+def test_the_smallest_image_has_one_pixel_and_one_ray():
+    rays, valid = Pinhole(1, 1, 2.0, 4.0, 0.5, 0.5).rays()
+    assert rays.tolist() == [[[0, 0, 1]]] and valid.all()
+    for size in ((0, 1), (1, 0)):
+        with refused(where="camera size"):
+            Pinhole(*size, 2.0, 4.0, 0.5, 0.5)
+    for focal in ((0.0, 1.0), (1.0, 0.0)):
+        with refused(where="PINHOLE camera", found="focal lengths"):
+            Pinhole(1, 1, *focal, 0.5, 0.5)

@@ -15,7 +15,7 @@ from raising import refused
 
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel, FullBrown, KannalaBrandt, Pinhole, Scaramuzza
-from lightdepth.camera.foreign import LARGEST_ERROR_PX
+from lightdepth.camera.foreign import LARGEST_ERROR_PX, ForeignLens, _samples, nearest, opencv_bend
 from lightdepth.cli import main
 from lightdepth.maps import read_map
 from lightdepth.native import pycolmap
@@ -291,3 +291,44 @@ def test_a_refused_coefficient_names_its_file_once(tmp_path, capsys):
     file = written(tmp_path / "a.yaml", numbers)
     assert main(["convert-camera", str(file), "-o", str(tmp_path / "c.json")]) == 3
     assert capsys.readouterr().err.count(str(file)) == 1
+
+
+def test_a_lens_is_followed_to_where_a_quarter_of_its_resolution_is_left_and_no_farther():
+    lens = ForeignLens("turning", 4000, 4000, (1000.0, 1000.0, 2000.0, 2000.0), _turning)
+    rays, pixels, area = _samples(lens, "here")
+    theta = np.arccos(rays[:, 2])
+    assert np.degrees(theta.max()) == pytest.approx(np.degrees(np.sqrt(0.75 / 0.6)), abs=0.4)
+    np.testing.assert_allclose(pixels, lens.pixels(rays))
+    inner = theta < 0.5  # the image's area between two angles grows with the radius
+    np.testing.assert_allclose(area[inner], _area(theta[inner]), rtol=0.02, atol=2.0)
+
+
+def _turning(rays: np.ndarray) -> np.ndarray:
+    """radius = theta - 0.2 theta^3, whose slope 1 - 0.6 theta^2 falls to a quarter at 64 degrees."""
+    theta = np.arccos(rays[:, 2])
+    side = np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-12)
+    found: np.ndarray = rays[:, :2] * ((theta - 0.2 * theta**3) / side)[:, None]
+    return found
+
+
+def _area(theta: np.ndarray) -> np.ndarray:
+    step = np.radians(89.5) / 499
+    return 1000**2 * (theta - 0.2 * theta**3) * (1 - 0.6 * theta**2) * step
+
+
+def test_a_lens_of_nearly_our_longest_polynomial_becomes_that_and_is_off_by_what_it_lacks():
+    bend = opencv_bend((-0.3, 0.1, 1e-3, -5e-4, -0.01, 0.0, 0.0, 0.0, 2e-4, 0.0, -1e-4, 0.0))
+    lens = ForeignLens("prism", 640, 480, (420.0, 410.0, 322.0, 238.0), bend)
+    with pytest.warns(UserWarning, match="OPENCV") as said:
+        camera = nearest(lens, "here")
+    assert isinstance(camera, FullBrown) and len(said) == 1
+    rays = rays_of(camera)
+    assert 0 < off(camera, lens.pixels(rays), rays) < 0.1
+    np.testing.assert_allclose(camera.params[:5], (420, 410, 322, 238, -0.3), rtol=0.01)
+
+
+def test_a_lens_is_sampled_to_the_corners_of_its_image():
+    lens = ForeignLens("straight", 640, 480, (410.0, 410.0, 300.0, 260.0), opencv_bend(()))
+    _, pixels, _ = _samples(lens, "here")
+    for corner in ((0, 0), (640, 0), (0, 480), (640, 480)):
+        assert np.linalg.norm(pixels - corner, axis=1).min() < 4

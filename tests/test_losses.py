@@ -9,6 +9,7 @@ from lightdepth.frame import FrameBatch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.losses import (
     LossConfig,
+    Seen,
     albedo_loss,
     brightness_residual,
     chroma_loss,
@@ -32,6 +33,7 @@ from lightdepth.losses import (
     training_loss,
     uncertainty_loss,
 )
+from lightdepth.losses.config import TERMS
 from lightdepth.photometry import LightTerms, PhotometricCalibration, bent, encode, hue_saturation_albedo
 
 LAMBERT = LossConfig(cosine_exponent=1.0, reflectance=0.0, cosine_floor=0.0)
@@ -457,3 +459,51 @@ def test_the_indirect_light_of_a_large_image_is_that_of_a_small_one():
 
     assert torch.allclose(light(384).log(), light(128).log(), atol=0.03)
     assert not torch.allclose(light(384).log(), light(32).log(), atol=0.03)
+
+
+def test_what_is_rendered_brighter_than_white_counts_as_white_in_ssim():
+    image = torch.rand(1, 3, 12, 12, generator=torch.Generator().manual_seed(0))
+    usable = torch.ones(1, 1, 12, 12, dtype=torch.bool)
+    rendered = (image * 1.5 - 0.2).clamp(0, 1)
+    beyond = torch.where(rendered == 1, 1.7, torch.where(rendered == 0, -0.4, rendered))
+    assert (rendered == 1).any() and (rendered == 0).any()
+    torch.testing.assert_close(ssim_loss(image, beyond, usable), ssim_loss(image, rendered, usable))
+
+
+@pytest.mark.parametrize("name", ["ssim", "specular", "albedo"])
+def test_a_term_is_taken_where_it_has_a_weight_and_the_total_is_their_weighted_sum(name):
+    batch, albedo = tube_batch()
+    config = replace(LAMBERT, **{name: 0.7})
+    total, terms = self_supervised_loss(spoilt(batch.true_distance), albedo, batch, config)
+    always = {"photometric", "saturated", "facing", "smoothness", "chroma"}
+    assert set(terms) == always | {name}
+    torch.testing.assert_close(total, sum(getattr(config, term) * value for term, value in terms.items()))
+    assert set(self_supervised_loss(batch.true_distance, None, batch, LAMBERT)[1]) == always - {"chroma"}
+
+
+@pytest.mark.parametrize("name", [*TERMS, "self_supervised", "supervised", "uncertainty", "huber", "ambient"])
+def test_no_weight_is_below_zero_and_zero_is_one(name):
+    assert getattr(LossConfig(**{name: 0.0}), name) == 0
+    with refused(where="loss"):
+        LossConfig(**{name: -1e-3})
+
+
+@pytest.mark.parametrize("shoulder", [0.19, 1.01])
+def test_a_shoulder_lies_between_a_fifth_and_white(shoulder):
+    assert [LossConfig(shoulder=s).shoulder for s in (0.2, 1.0)] == [0.2, 1.0]
+    with refused(where="loss"):
+        LossConfig(shoulder=shoulder)
+
+
+def test_white_pixels_and_black_ones_tell_nothing_of_distance_and_only_white_ones_in_the_mask_are_saturated():
+    batch, _ = tube_batch()
+    image, mask = batch.image.clone(), batch.mask.clone()
+    image[..., :4, :], image[..., 4:8, :], mask[..., 2:6, :] = 1.0, 0.0, False
+    image[:, 0, 8:10] = 0.971
+    seen = Seen.of(batch._replace(image=image, mask=mask), LAMBERT)
+    white = torch.zeros_like(mask)
+    white[..., :2, :], white[..., 8:10, :] = True, True
+    assert torch.equal(seen.saturated, white)
+    assert not (seen.usable & (white | ~mask)).any() and not seen.usable[..., :8, :].any()
+    assert seen.usable[..., 14:, :].float().mean() > 0.9
+    torch.testing.assert_close(seen.log_v.exp(), image.amax(1, keepdim=True).clamp(min=0.01))

@@ -143,3 +143,16 @@ def test_places_are_packed_and_unpacked_below_zero_too_and_keep_their_order():
     assert np.array_equal(unpacked(packed(places)), places)
     some = np.random.default_rng(0).integers(-3, 4, (50, 3))
     assert np.array_equal(some[np.argsort(packed(some), kind="stable")], some[np.lexsort(some.T[::-1])])
+
+
+def test_a_surface_that_outgrows_its_first_memory_is_whole():
+    """Of 27 blocks of noise: more corners and more vertices than there is room for at first."""
+    values = np.ones((24, 24, 24))
+    values[1:23, 1:23, 1:23] = noise(5, 22, 22, 22)
+    found = cut_of(values)
+    assert len(found.rows) == 27 and 3 * len(found.triangles) > 49152 and len(found.names) > 8192
+    _, triangles = surface(values)
+    edges = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+    assert np.array_equal(np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0))
+    place, axis = unpacked(found.names // 3), found.names % 3
+    np.testing.assert_allclose(found.positions, place + found.share[:, None] * np.eye(3)[axis])

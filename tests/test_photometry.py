@@ -253,3 +253,13 @@ def test_a_co_located_light_sits_at_the_camera_and_looks_along_the_axis():
 def test_a_light_that_cannot_be_is_refused(wrong, message):
     with refused(message):
         PhotometricCalibration(**wrong)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [{"gamma": 0.2}, {"gamma": 10.0}, {"mu": 0.0}, {"gain": 1e-3}, {"reflectance": 0.0}, {"reflectance": 0.99}],
+)
+def test_a_light_at_its_limits_is_taken(limits):
+    light = PhotometricCalibration(**limits)
+    assert {name: getattr(light, name) for name in limits} == limits and light.assumed
+    assert not PhotometricCalibration(source="given").assumed

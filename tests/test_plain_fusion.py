@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scenes import BROWN, ENDOMAPPER, slanted_plane
 
-from densify.fusion.plain import undistorted
-from lightdepth.camera import CameraModel
+from densify.fusion.plain import PlainTsdf, undistorted, undistorted_camera
+from lightdepth.camera import CameraModel, Pinhole
 
 NORMAL, HEIGHT = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0]), 12.0
 
@@ -36,3 +36,31 @@ def test_what_is_beyond_the_greatest_distance_along_its_ray_has_no_depth():
     distance = whole / pinhole.rays()[0][..., 2]
     np.testing.assert_array_equal(near > 0, (whole > 0) & (distance <= 14.0))
     assert 0.1 < (near > 0).sum() / (whole > 0).sum() < 0.9
+
+
+def test_the_undistorted_camera_has_the_lens_s_focal_length_and_principal_point():
+    lens = ENDOMAPPER.resized(144, 108)
+    found = undistorted_camera(lens)
+    f = np.sqrt(lens.fx * lens.fy)
+    np.testing.assert_allclose(found.params, (f, f, lens.cx, lens.cy))
+    assert (found.width, found.height) == (144, 108) and undistorted_camera(found) is found
+
+
+def test_the_paper_s_volume_has_the_plane_where_it_was_seen_in_its_colour():
+    camera, pose = Pinhole(60, 40, 50.0, 50.0, 30.0, 20.0), np.eye(4)
+    pose[:3, 3] = 0.5, -0.2, 1.0
+    depth, color = np.full((40, 60), 4.0, np.float32), np.full((40, 60, 3), 0.25, np.float32)
+    depth[:, 40:] = np.nan
+    depth[0, 0] = 6.0
+    volume = PlainTsdf(0.1, 6.0)
+    assert [len(part) for part in volume.extract_mesh()] == [0, 0, 0]
+    volume.integrate(np.full((40, 60), np.nan, np.float32), color, camera, pose)
+    assert [part.shape for part in volume.extract_mesh()] == [(0, 3)] * 3  # nothing is known: nothing is seen
+    volume.integrate(depth, color, camera, pose)
+    vertices, triangles, colors = volume.extract_mesh()
+    wall = np.abs(vertices[:, 2] - 3) < 0.02
+    assert wall.mean() > 0.9 and len(vertices) > 300 and triangles.max() == len(vertices) - 1
+    assert (np.abs(colors - 0.25) < 0.01).mean() > 0.95  # not at the rim
+    # Columns 0 to 40 of 60 at depth 4, seen from (-0.5, 0.2, -1).
+    np.testing.assert_allclose(vertices[wall].min(0)[:2], (-2.4 - 0.5, -1.6 + 0.2), atol=0.35)
+    np.testing.assert_allclose(vertices[wall].max(0)[:2], (0.8 - 0.5, 1.6 + 0.2), atol=0.35)

@@ -17,6 +17,7 @@ from densify.evaluation.trajectory import (
     align_trajectory,
     in_order,
     read_trajectories,
+    span,
     trajectory_files,
     trajectory_summary,
 )
@@ -227,3 +228,10 @@ def test_a_file_that_is_no_trajectory_is_refused(tmp_path):
 def test_trajectories_are_born_valid():
     with pytest.raises(AssertionError, match="ascend"):
         Trajectory(0, np.array([3, 1]), np.zeros((2, 3)), np.ones(2, bool), True)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"), [([], "none"), ([4], "frame 4"), ([5, 4], "frames 4 to 5"), ([9, 3, 4], "frames 3 to 9")]
+)
+def test_numbers_are_said_as_people_say_them(numbers, said):
+    assert span(numbers) == span(np.array(numbers, int)) == said
