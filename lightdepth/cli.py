@@ -11,6 +11,7 @@ import ast
 import inspect
 import io
 import sys
+from contextlib import suppress
 from functools import partial
 from importlib import metadata, util
 from pathlib import Path
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 from lightdepth import __version__
 from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.command_line.pipes import outliving_readers
+from lightdepth.command_line.signals import ending_on_signals
 from lightdepth.command_line.warned import warnings_as_sentences
-from lightdepth.errors import InputError, PartialFailure
+from lightdepth.errors import InputError, Interrupted, PartialFailure
 
 GROUP = "lightdepth.commands"
 ORDER = (
@@ -50,12 +52,18 @@ ORDER = (
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed."""
+    """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed, 128 + n signal n."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show ends no run
-    with outliving_readers(), warnings_as_sentences():
-        return _main(sys.argv[1:] if argv is None else argv)
+    given = sys.argv[1:] if argv is None else argv
+    try:
+        with ending_on_signals(), outliving_readers(), warnings_as_sentences():
+            return _main(given)
+    except Interrupted as error:
+        with suppress(OSError):  # the terminal may be what is gone
+            print(f"lightdepth {given[0] if given else ''}: {error}", file=sys.stderr, flush=True)
+        return 128 + error.signal
 
 
 def _main(argv: list[str]) -> int:
@@ -96,7 +104,7 @@ def _main(argv: list[str]) -> int:
         name = str(error.object).encode("utf-8", "backslashreplace").decode()
         print(f"lightdepth {verb}: {name[:300]}: a name that is not UTF-8; rename it", file=sys.stderr)
         return 3
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # where signals are not ours: outside the main thread
         print(f"lightdepth {verb}: interrupted", file=sys.stderr)
         return 130
 
