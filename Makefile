@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= runs/demo
 export OMP_WAIT_POLICY = passive
 
-.PHONY: setup demo test test-slow coverage lint format bench same ablation clean
+.PHONY: setup demo test test-slow fuzz coverage lint format bench same ablation clean
 
 setup: $(VENV)/.ready
 
@@ -23,6 +23,13 @@ test: setup
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow
+
+# Spoilt files for every parser, each in a process with 1 GB: make fuzz SECONDS=600 PARSER="mask video". What fails is
+# kept in tests/corpus. With the extra `fuzz` installed it is guided by the lines that inputs reach.
+SECONDS ?= 60
+PARSER ?=
+fuzz: setup
+	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz.py --seconds $(SECONDS) $(PARSER)
 
 # Machine code counts no lines, so the tests of the compiled loops run once more with Numba off; all tests would take
 # hours so. The floor stands in pyproject.toml.

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -31,6 +32,7 @@ from densify.bending import Bend, BendingConfig
 from lightdepth.brief import Brief
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction, log_distance_at
+from lightdepth.ranges import above, at_least, checked
 from lightdepth.robust import lower_quartile, mad_sigma, robust_weights
 from lightdepth.sparse_map import Keyframe
 
@@ -40,32 +42,33 @@ _LEAST_SIGMA = 0.01  # of log distance: exact data must not make a single residu
 
 
 @dataclass(frozen=True)
+@checked
 class AgreementConfig:
     """What the keyframes of a submap must agree on."""
 
     on: bool = True
     """Whether the keyframes of a submap, each with its own scale, are then fitted together and bent (see bending);
     switched off, each keeps its one scale and nothing bends."""
-    overlap: float = 0.03
+    overlap: Annotated[float, at_least(0)] = 0.03
     """Weight, against 1 for a map point, of the disagreement of two keyframes at a pixel that both see; 0 compares
     none, and live never does. A larger one makes keyframes agree better with each other, and fit their points less."""
-    neighbours: int = 4
+    neighbours: Annotated[int, at_least(0, up_to=1000)] = 4
     """Number of keyframes that each is compared with, those that share most map points with it; live compares none.
     More hold the submap together better and take longer."""
-    samples: int = 16
+    samples: Annotated[int, at_least(1, up_to=10_000)] = 16
     """Number of pixels across the image at which keyframes are compared, and as many down as keeps the spacing equal;
     live compares none. More find finer disagreement and take longer."""
-    rounds: int = 8
+    rounds: Annotated[int, at_least(1, up_to=10_000)] = 8
     """Largest number of rounds (Gauss-Newton steps) in which keyframes are fitted together; tolerance may end them
     sooner. More come closer to the solution and take longer."""
-    tolerance: float = 1e-3
+    tolerance: Annotated[float, at_least(0)] = 1e-3
     """Change of the fit, in log distance (0.001 is 0.1 %), below which a round is the last. A larger one ends sooner,
     at a less exact solution."""
-    shared_error: float = 0.03
+    shared_error: Annotated[float, at_least(0)] = 0.03
     """Error, in log distance (0.03 is 3 %), that map points in the same part of an image (of 8 x 8) have in common:
     however many they are, they count for no more than one point with that error. A larger one fits depth less closely
     to crowded points; 0 counts each on its own."""
-    max_gap: float = 0.5
+    max_gap: Annotated[float, above(0)] = 0.5
     """Disagreement, in log distance (0.5 is a factor of 1.6), from which two keyframes count as seeing different tissue
     at a pixel and are not compared there; live compares none. A larger one compares more pixels."""
 

@@ -10,7 +10,7 @@ Notation: a mapped, b predicted distance of a point; s the scale; the ratios a /
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 
@@ -19,12 +19,14 @@ from lightdepth.brief import Brief
 from lightdepth.errors import InputError
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
+from lightdepth.ranges import COUNT, SHARE, above, at_least, checked
 from lightdepth.robust import Loss, inlier_sigma, lmeds_scale, refine_scale
 
 Estimator = Literal["lmeds", "median"]
 
 
 @dataclass(frozen=True)
+@checked
 class AlignmentConfig:
     """When a keyframe's scale is found, and when it is trusted."""
 
@@ -32,7 +34,7 @@ class AlignmentConfig:
     """How a keyframe's first scale is found from its points' ratios of mapped to predicted distance: lmeds takes the
     ratio with the least median of squared residuals, median the median ratio. median is never refined (refine, loss),
     and serves to compare with."""
-    t: float = 2.5
+    t: Annotated[float, above(0)] = 2.5
     """Number of sigmas (sigma is the robust standard deviation of what lies between a keyframe's map points and its
     scaled depth) within which a map point counts as right, an inlier. A larger one takes in more points, wrong ones
     among them."""
@@ -45,25 +47,25 @@ class AlignmentConfig:
     loss: Loss = "geman_mcclure"
     """Robust loss of that refinement: geman_mcclure, huber, cauchy or tukey. An inlier that is off by 2.5 sigmas keeps
     a weight of 0.02 with geman_mcclure, and of about 0.5 with each of the others."""
-    min_points: int = 8
+    min_points: Annotated[int, COUNT] = 8
     """Least number of map points, observed where the model predicts a distance, that a keyframe needs; one with fewer
     is left out of the surface. More make scales safer and leave out more keyframes."""
-    min_inliers: int = 6
+    min_inliers: Annotated[int, COUNT] = 6
     """Least number of inliers (points within t sigmas) that a keyframe needs; one with fewer is left out of the
     surface. More make scales safer and leave out more keyframes."""
-    min_inlier_share: float = 0.5
+    min_inlier_share: Annotated[float, SHARE] = 0.5
     """Least share, in [0, 1], of a keyframe's observed points that must be inliers; with less it is left out of the
     surface. A larger one leaves out more keyframes."""
-    max_relative_sigma: float = 0.35
+    max_relative_sigma: Annotated[float, at_least(0)] = 0.35
     """Largest sigma (robust standard deviation of a keyframe's residuals), as a share of its points' median distance,
     with which a keyframe is used. A larger one also uses keyframes whose points disagree more."""
-    min_spread_deg: float = 3.0
+    min_spread_deg: Annotated[float, at_least(0, up_to=180)] = 3.0
     """Least spread of a keyframe's inliers over its view, degrees: the root mean square angle between their rays and
     the mean ray. A larger one leaves out keyframes whose inliers lie close together in the image."""
-    min_distance_spread: float = 0.02
+    min_distance_spread: Annotated[float, at_least(0)] = 0.02
     """Least standard deviation of the log distance of a keyframe's inliers (0.02 is about 2 %). A larger one leaves out
     keyframes whose inliers are all about equally far, which tell nothing of other distances."""
-    max_second_mode: float = 0.6
+    max_second_mode: Annotated[float, at_least(0)] = 0.6
     """Largest ratio of the number of points that agree on a rival scale to the number that agree on the one found;
     above it the keyframe is left out. A larger one also uses keyframes with a stronger rival."""
 
@@ -74,8 +76,6 @@ class AlignmentConfig:
                 f"{self.estimator!r} is not known",
                 f"expected one of {', '.join(get_args(Estimator))}",
             )
-        if not self.t > 0:
-            raise InputError("alignment.t", f"{self.t}", "expected a positive number of sigmas, such as 2.5")
 
 
 @dataclass(frozen=True, repr=False)

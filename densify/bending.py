@@ -14,41 +14,33 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 
 from lightdepth.brief import Brief
-from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
+from lightdepth.ranges import above, at_least, checked
 
 
 @dataclass(frozen=True)
+@checked
 class BendingConfig:
     """How a keyframe's depth may bend. Off, it is scaled only."""
 
     on: bool = True
     """Whether a keyframe's depth is multiplied by a smooth field over the image, its bend, so that it fits the map's
     points; switched off, it is multiplied by one number."""
-    grids: tuple[int, ...] = (5,)
+    grids: Annotated[tuple[int, ...], at_least(2, up_to=64)] = (5,)
     """Number n of smooth bumps across and down the image that make up the bend, n x n of them, at least 2; several
     numbers lay several such grids over each other. More let depth bend in finer detail."""
-    slope_deviation: float = 0.3
+    slope_deviation: Annotated[float, at_least(0)] = 0.3
     """How strongly the factor on distance is expected to change with distance itself (standard deviation, a ratio:
     change of the factor's log per change of the log of predicted distance), besides over the image; a soft limit, 0
     for no such change. A larger one lets near wall be stretched against far wall more freely."""
-    bump_deviation: float = 0.1
+    bump_deviation: Annotated[float, above(0)] = 0.1
     """Expected size (standard deviation) of each bump of the bend, in log distance (0.1 is 10 %), above 0. A larger one
     lets depth bend more strongly."""
-
-    def __post_init__(self) -> None:
-        if any(n < 2 for n in self.grids):
-            raise InputError("bending.grids", f"{list(self.grids)}", "expected at least 2 bumps across and down")
-        if self.slope_deviation < 0 or not self.bump_deviation > 0:
-            raise InputError(
-                "bending",
-                f"slope_deviation {self.slope_deviation}, bump_deviation {self.bump_deviation}",
-                "expected at least 0 (no slope) and above 0",
-            )
 
     @property
     def precision(self) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from densify.agreement import AgreementConfig
 from densify.alignment import AlignmentConfig
@@ -15,6 +15,7 @@ from densify.fusion.volume import FusionConfig
 from densify.judging.ahead import AheadConfig
 from densify.judging.config import JudgeConfig
 from lightdepth.errors import InputError
+from lightdepth.ranges import at_least, checked
 
 Recipe = Literal["full", "paper"]
 
@@ -73,6 +74,7 @@ class OfflineConfig(MethodConfig):
 
 
 @dataclass(frozen=True)
+@checked
 class DensifyConfig(OfflineConfig):
     """How the dense maps of a finished sparse map are made.
 
@@ -88,7 +90,7 @@ class DensifyConfig(OfflineConfig):
     """How dense maps are made: full, with all steps below, or paper, as published: one LMedS scale per keyframe, one
     undistorted pinhole image, a plain TSDF. paper refuses settings of agreement, bending, contradiction and rectify,
     which it has not, and ignores coverage and fusion.min_views."""
-    keep_mb: float = 1000.0
+    keep_mb: Annotated[float, at_least(0)] = 1000.0
     """Memory, megabytes, for the images and predictions of a submap that are kept from one pass over it to the next;
     what does not fit is read and predicted again. More save time and change nothing else."""
 

@@ -14,28 +14,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 
 from densify.agreement import View, gap_between
 from densify.bending import Bend
+from lightdepth.ranges import above, at_least, checked
 
 
 @dataclass(frozen=True)
+@checked
 class ContradictionConfig:
     """When a pixel is contradicted."""
 
     on: bool = True
     """Whether a pixel is left out of the surface where keyframes nearer to the wall look through it and see wall
     farther on; switched off, it stays."""
-    tolerance: float = 0.05
+    tolerance: Annotated[float, above(0)] = 0.05
     """Difference, in log distance (0.05 is 5 %), up to which two keyframes agree on a pixel; only beyond it can one
     contradict the other. A larger one leaves out fewer pixels."""
-    judges: int = 8
+    judges: Annotated[int, at_least(1, up_to=1000)] = 8
     """Number of other keyframes that each keyframe is compared with, chosen evenly in time among those that share map
     points with it. More let more of its pixels be compared, so more may be removed, and take longer."""
-    samples: int = 80
+    samples: Annotated[int, at_least(1, up_to=10_000)] = 80
     """Number of pixels across the image that are compared, and in proportion down; each speaks for the cell around it.
     More tell the edges of what is left out more finely and take longer."""
 

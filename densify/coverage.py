@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -22,24 +23,26 @@ from densify.judging.images import Seen
 from densify.trust import coarse_sigma, expected_error, vertex_normals
 from lightdepth.datasets import FrameSequence
 from lightdepth.prediction import DepthPrediction
+from lightdepth.ranges import at_least, checked
 from lightdepth.sparse_map import Keyframe
 
 
 @dataclass(frozen=True)
+@checked
 class CoverageConfig:
     """When wall counts as seen well, and what is too small to mention."""
 
-    views: int = 3
+    views: Annotated[int, at_least(0)] = 3
     """Least number of keyframes that must have seen a piece of wall for the report to call it seen well; the surface
     stays as it is. More make less wall count as seen well."""
-    weight: float = 1.0
+    weight: Annotated[float, at_least(0)] = 1.0
     """Least sum of the weights of all looks at a piece of wall for it to be called seen well: a keyframe looking
     straight at lit wall counts 1, a slanted, dark, saturated or uncertain look less. A larger one makes less wall count
     as seen well."""
-    error: float = DOUBTED
+    error: Annotated[float, at_least(0)] = DOUBTED
     """Largest error that may be expected of a vertex, as a share of the distance of a typical inlier. A
     larger one calls more wall seen well, and more of it is wrong."""
-    min_voxels: float = 5.0
+    min_voxels: Annotated[float, at_least(0)] = 5.0
     """Side of a square, in voxels: holes and weakly seen patches of a smaller area than its are not listed in the
     report. A larger one lists fewer."""
 

@@ -19,6 +19,8 @@ from lightdepth.brief import Brief
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
+from lightdepth.files.meshes import load_mesh
+from lightdepth.files.reading import reading
 from lightdepth.files.schema import read_json
 from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.sparse_map import Keyframe, Submap
@@ -259,7 +261,12 @@ def map_folders(path: Path) -> list[Path]:
 def run_record(path: Path) -> Mapping[str, object]:
     """run.json of a run folder, or of the one that a map folder is in; empty where there is none."""
     folder = path.parent if map_folders(path) == [path] else path
-    return read_json(folder / "run.json") if (folder / "run.json").is_file() else {}
+    if not (folder / "run.json").is_file():
+        return {}
+    found = read_json(folder / "run.json")
+    if not isinstance(found, dict):
+        raise InputError(folder / "run.json", f"holds {type(found).__name__}", "expected what a verb wrote there")
+    return found
 
 
 def read_dense_map(folder: str | Path) -> DenseMapFiles:
@@ -271,6 +278,11 @@ def read_dense_map(folder: str | Path) -> DenseMapFiles:
     map_id = folder.name.removeprefix("map_").removeprefix("joined_")
     if not (map_id.isascii() and map_id.isdigit()):
         raise InputError(folder, "no number of a map in its name", "expected a name such as map_000 or joined_000")
+    with reading(folder, "a readable map folder"):
+        return _dense_map(folder, int(map_id))
+
+
+def _dense_map(folder: Path, map_id: int) -> DenseMapFiles:
     mesh, cloud = _read_ply(folder / "mesh.ply"), _read_ply(folder / "sparse.ply")
     triangles = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), int)
     numbers, poses = read_tum(folder / "trajectory.tum")
@@ -280,7 +292,7 @@ def read_dense_map(folder: str | Path) -> DenseMapFiles:
     wanted = ("confidence", "views", "expected_error")
     own = {name: np.asarray(raw[name]).ravel() if name in names else None for name in wanted}
     return DenseMapFiles(
-        id=int(map_id),
+        id=map_id,
         vertices=np.asarray(getattr(mesh, "vertices", np.zeros((0, 3))), float),  # an empty mesh is read as a scene
         triangles=triangles,
         sparse=np.asarray(cloud.vertices, float),
@@ -293,9 +305,4 @@ def read_dense_map(folder: str | Path) -> DenseMapFiles:
 
 
 def _read_ply(path: Path) -> Any:
-    import trimesh
-
-    try:
-        return trimesh.load(path, process=False)
-    except (ValueError, KeyError, IndexError, OSError) as error:
-        raise InputError(path, f"damaged, or not a PLY file ({error})", "copy it again") from error
+    return load_mesh(path, "a PLY file, or it is damaged", "copy it again")

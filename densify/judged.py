@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 from densify.config import DensifyConfig
 from densify.dense_map import map_folders
@@ -27,7 +28,7 @@ from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged
 from densify.evaluation.suite import Suite, present, read_suite
 from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.evaluation.truth import check_truth, read_truth
-from densify.inputs import MapSource, check_unit, map_and_frames
+from densify.inputs import MapSource, map_and_frames
 from densify.judging.withheld import WithheldOfMap, withheld_errors
 from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
@@ -35,12 +36,14 @@ from lightdepth.datasets.reading import stamps_of
 from lightdepth.errors import InputError
 from lightdepth.maps.convention import MapReading, Reader
 from lightdepth.models import DepthModel
+from lightdepth.ranges import Range, above, checked
 from lightdepth.reporting.run import Run
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sparse_map import SparseMap
 
 
 @dataclass(frozen=True)
+@checked
 class TruthSource:
     """What is judged against, and how it is read."""
 
@@ -55,7 +58,7 @@ class TruthSource:
     mask: Path | None = None
     """Image, white where tissue shows and black elsewhere: only there is judged; left out, the truth folder's own mask,
     where it has one."""
-    bit_depth: int | None = None
+    bit_depth: Annotated[int | None, Range(8, 32)] = None
     """Bits of a sample in the truth's pictures that are stored in more than 8; left out, what the files say, else what
     their highest values show. A larger one reads the same numbers as darker."""
     truth_mesh: Path | None = None
@@ -69,16 +72,17 @@ class TruthSource:
 
 
 @dataclass(frozen=True)
+@checked
 class JudgingConfig(MapReading):
     """How errors are taken."""
 
-    mm_per_unit: float | None = None
+    mm_per_unit: Annotated[float | None, above(0)] = None
     """Millimetres per map unit, where known, for the trajectory's error after SE(3), that is without fitting its scale;
     left out, only runs in mm have that figure. A larger one takes the trajectory for larger; other errors stay."""
-    thresholds_mm: tuple[float, ...] = THRESHOLDS_MM
+    thresholds_mm: Annotated[tuple[float, ...], above(0)] = THRESHOLDS_MM
     """Distances, mm, up to which a surface point counts as right in precision, recall and F-score, each with figures of
     its own. Larger ones count more points."""
-    max_depth_mm: float = 100.0
+    max_depth_mm: Annotated[float, above(0)] = 100.0
     """True depth along the camera's axis, mm, beyond which pixels are not judged in a folder of predictions; surfaces
     are judged whole. A larger one judges farther wall too."""
     common: bool = False
@@ -91,9 +95,8 @@ class JudgingConfig(MapReading):
     """Go on with a map whose frames, by their images, are others than those that it was made of, and only warn."""
 
     def __post_init__(self) -> None:
-        check_unit(self.mm_per_unit)
-        if not self.thresholds_mm or not all(t > 0 for t in self.thresholds_mm):
-            raise InputError("--thresholds-mm", f"{list(self.thresholds_mm)}", "expected positive distances in mm")
+        if not self.thresholds_mm:
+            raise InputError("--thresholds-mm", f"{list(self.thresholds_mm)}", "expected distances in mm")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from lightdepth.errors import InputError
 from lightdepth.files.schema import read_json
+from lightdepth.files.weights import MAX_HEADER, check_header, read_pickled
 from lightdepth.files.writing import write_whole
 from lightdepth.models import ConstantModel, DeclineModel, DepthModel, NetworkModel
 from lightdepth.network import DepthNetwork, NetworkConfig, build_network
@@ -38,7 +40,7 @@ HUB = "hf://"
 
 _WEIGHTS = Path(__file__).parent / "weights"
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-_DEFAULT_ROWS = 128
+_DEFAULT_ROWS, _MAX_ROWS = 128, 4096
 
 
 def bundled() -> list[str]:
@@ -136,20 +138,52 @@ def read_card(path: Path | str) -> dict[str, Any]:
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
+    check_header(path, "copy it again")
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = _described(path, file.metadata() or {})
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-        config, card = json.loads(metadata["network"]), json.loads(metadata["card"])
-    except (SafetensorError, OSError, ValueError) as error:
+            network, card = json.loads(metadata["network"]), json.loads(metadata["card"])
+            config = _config(network, card, path)
+            names = list(file.keys())
+            _check_fit(config, {name: tuple(file.get_slice(name).get_shape()) for name in names}, path)
+            weights = {name: file.get_tensor(name) for name in names}
+    except InputError:
+        raise
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise InputError(path, f"damaged or not a safetensors file ({error})", "copy it again") from error
     except KeyError as error:
         raise InputError(
             path, f"metadata {error} missing", "expected a checkpoint exported by `lightdepth train`"
         ) from error
-    if not isinstance(config, dict) or not isinstance(card, dict):
+    return weights, config, card
+
+
+def _config(network: object, card: object, path: Path) -> NetworkConfig:
+    if not isinstance(network, dict) or not isinstance(card, dict):
         raise InputError(path, "metadata is not two JSON objects", "expected one exported by `lightdepth train`")
-    return weights, NetworkConfig.from_dict(config), card
+    try:
+        return NetworkConfig.from_dict(network)
+    except InputError as error:
+        raise error.within(path) from error
+
+
+def _check_fit(config: NetworkConfig, shapes: Mapping[str, tuple[int, ...]], path: Path) -> None:
+    """Raises InputError where weights of these shapes are not those of the network. No memory is given to either."""
+    with torch.device("meta"):
+        wanted = {name: tuple(value.shape) for name, value in build_network(config).state_dict().items()}
+    problems = [f"{name} missing" for name in wanted.keys() - shapes.keys()]
+    problems += [f"{name} unknown" for name in shapes.keys() - wanted.keys()]
+    problems += [
+        f"{name} is {shapes[name]}, expected {wanted[name]}"
+        for name in wanted.keys() & shapes.keys()
+        if shapes[name] != wanted[name]
+    ]
+    if problems:
+        raise InputError(
+            path,
+            f"weights do not fit a {config.kind} network ({min(problems)[:200]})",
+            "expected a checkpoint of this version of the program",
+        )
 
 
 def _described(path: Path, metadata: dict[str, str]) -> dict[str, str]:
@@ -157,7 +191,11 @@ def _described(path: Path, metadata: dict[str, str]) -> dict[str, str]:
     beside = path.with_name(CONFIG_FILE)
     if {"network", "card"} <= metadata.keys() or path.name != WEIGHTS_FILE or not beside.is_file():
         return metadata
+    if beside.stat().st_size > MAX_HEADER:
+        raise InputError(beside, f"longer than {MAX_HEADER} bytes", "expected the network and its card, two objects")
     found = read_json(beside)
+    if not isinstance(found, dict):
+        raise InputError(beside, "no object in it", "expected the network and its card, two objects")
     return {name: json.dumps(found[name]) for name in ("network", "card") if name in found}
 
 
@@ -168,29 +206,28 @@ def _load_safetensors(path: Path, name: str, details: bool) -> NetworkModel:
 
 
 def _load_lightning(path: Path, details: bool) -> NetworkModel:
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged or hostile pickle can raise anything; it is never executed
-        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise InputError(
-            path,
-            f"damaged, or holds more than weights and plain values ({first})",
-            "expected a checkpoint written by `lightdepth train`",
-        ) from error
+    expected = "expected a checkpoint written by `lightdepth train`"
+    checkpoint = read_pickled(path, expected)
     try:
         hyper, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
-        config = NetworkConfig.from_dict(dict(hyper["network"]))
+        config = _config(dict(hyper["network"]), {}, path)
         prefix = "network."
         weights = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(path, f"{error!r}", "expected a checkpoint written by `lightdepth train`") from error
+        shapes = {name: tuple(value.shape) for name, value in weights.items()}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(path, f"{error!r:.200}", expected) from error
+    _check_fit(config, shapes, path)
     return NetworkModel(_network(config, weights, path), _rows(hyper, path), path.stem, {}, details)
 
 
 def _rows(found: dict[str, Any], path: Path) -> int:
     rows = found.get("rows", _DEFAULT_ROWS)
-    if not isinstance(rows, int) or rows < 1:
-        raise InputError(path, f"rows {rows!r}", "expected the image height to predict at, in pixels")
+    if not isinstance(rows, int) or not 1 <= rows <= _MAX_ROWS:
+        short = isinstance(rows, float | str) or (isinstance(rows, int) and abs(rows) < 10**30)
+        shown = f"{rows!r:.30}" if short else f"of type {type(rows).__name__}"
+        raise InputError(path, f"rows {shown}", f"expected the image height to predict at, {_MAX_ROWS} pixels at most")
     return rows
 
 

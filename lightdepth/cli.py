@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import inspect
 import io
+import os
 import sys
 from contextlib import suppress
 from functools import partial
@@ -27,7 +28,14 @@ from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.command_line.pipes import outliving_readers
 from lightdepth.command_line.signals import ending_on_signals
 from lightdepth.command_line.warned import warnings_as_sentences
-from lightdepth.errors import InputError, Interrupted, PartialFailure
+from lightdepth.errors import (
+    AlreadyFinished,
+    InputError,
+    Interrupted,
+    MachineFailure,
+    MissingOption,
+    PartialFailure,
+)
 
 GROUP = "lightdepth.commands"
 ORDER = (
@@ -52,7 +60,8 @@ ORDER = (
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed, 128 + n signal n."""
+    """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed, 5 the machine failed
+    (disk, memory, a folder that is gone), 128 + n ended by signal n."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show ends no run
@@ -73,7 +82,7 @@ def _main(argv: list[str]) -> int:
         print(f"lightdepth: {error}", file=sys.stderr)
         return 3
     commands = {entry.name: entry for entry in metadata.entry_points(group=GROUP)}
-    if not argv or argv[0] in ("-h", "--help"):
+    if not argv or argv[0] in ("-h", "--help", "--help-all"):
         print(_help(commands))
         return 0 if argv else 2
     if argv[0] in ("-V", "--version"):
@@ -92,12 +101,20 @@ def _main(argv: list[str]) -> int:
         if list(inspect.signature(function).parameters) == ["argv"]:
             return function(rest) or 0
         return function(**parse(function, verb, rest)) or 0
+    except MissingOption as error:
+        print(f"lightdepth {verb}: {error}", file=sys.stderr)
+        return 2
     except InputError as error:
         print(f"lightdepth {verb}: {error}", file=sys.stderr)
         return 3
     except PartialFailure as error:
         print(f"lightdepth {verb}: {error}", file=sys.stderr)
         return 4
+    except AlreadyFinished as error:
+        print(f"lightdepth {verb}: {error}")
+        return 0
+    except (MachineFailure, OSError, MemoryError, RuntimeError) as error:
+        return _failed(verb, error)
     except UnicodeEncodeError as error:  # libraries that know UTF-8 alone
         if not any("\udc80" <= letter <= "\udcff" for letter in str(error.object)):
             raise
@@ -109,16 +126,34 @@ def _main(argv: list[str]) -> int:
         return 130
 
 
+def _failed(verb: str, error: Exception) -> int:
+    """One sentence for what the machine did (5), or for a file that cannot be used (3); other errors are ours."""
+    from lightdepth.files.machine import machine_failure
+
+    failure = error if isinstance(error, MachineFailure) else machine_failure(error)
+    if failure is not None:
+        print(f"lightdepth {verb}: {failure}", file=sys.stderr)
+        return 5
+    if not isinstance(error, OSError) or error.filename is None or isinstance(error.filename, int):
+        raise error
+    print(f"lightdepth {verb}: {os.fsdecode(error.filename)}: {error.strerror or error}", file=sys.stderr)
+    return 3
+
+
 def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
     from lightdepth.command_line.gone_settings import without_gone
     from lightdepth.command_line.options import with_groups
-    from lightdepth.command_line.parsing import fail, parsed
+    from lightdepth.command_line.parsing import config_files, fail, parsed
     from lightdepth.command_line.presets import with_preset
+    from lightdepth.files.replacing import check_apart
 
     parser = verb_parser(function, verb)
     argv = without_gone(verb, with_preset(verb, argv, partial(fail, parser)))
-    return with_groups(function, parser.instantiate(parsed(parser, argv)))
+    found = parsed(parser, argv)
+    if found.get("overwrite") and found.get("output"):
+        check_apart(Path(found["output"]), config_files(argv))
+    return with_groups(function, parser.instantiate(found))
 
 
 def verb_parser(function: Any, verb: str) -> Parser:
@@ -128,6 +163,7 @@ def verb_parser(function: Any, verb: str) -> Parser:
     from lightdepth.command_line.options import add_groups, groups_of
     from lightdepth.command_line.parsing import Parser, finish
     from lightdepth.command_line.presets import preset_help, presets
+    from lightdepth.command_line.ranges import ranges_in
 
     said = {p.arg_name: p.description for p in parse_docstring(inspect.getdoc(function) or "").params}
     # The first line only: jsonargparse shows the rest of the docstring beside the options.
@@ -158,7 +194,7 @@ def verb_parser(function: Any, verb: str) -> Parser:
     parser.add_function_arguments(
         function, as_positional=True, sub_configs=True, skip={*declared, *groups_of(function)}
     )
-    finish(parser, PAGES.get(verb, Page()))
+    finish(parser, PAGES.get(verb, Page()), ranges_in(function))
     return parser
 
 

@@ -33,6 +33,10 @@ class InputError(ValueError):
         return InputError(f"{outer}: {self.where}", self.found, self.cure)
 
 
+class MissingOption(InputError):
+    """An option that has to be given and was not: wrong usage. Exit code 2."""
+
+
 class PartialFailure(RuntimeError):
     """Part of the work failed; the rest was done and written. Exit code 4; `run.json` says what failed."""
 
@@ -51,3 +55,11 @@ class Interrupted(BaseException):
 
     def __str__(self) -> str:
         return f"stopped by {signal.Signals(self.signal).name}; {self.kept or 'nothing half-written is left'}"
+
+
+class MachineFailure(RuntimeError):
+    """The machine failed: a full disk, a folder that is gone, no memory. Exit code 5; says what was kept."""
+
+
+class AlreadyFinished(Exception):
+    """`--resume` of a run that is finished and the same: there is nothing to do. Exit code 0, one line."""

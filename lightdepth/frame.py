@@ -73,7 +73,7 @@ def check_image_size(name: str, width: int, height: int, camera: CameraModel) ->
             name,
             f"{found}: ratio {sx:.4g}",
             f"if the image was only resized, rescale the camera: multiply fx, fy, cx, cy by {sx:.6g} and set width "
-            f"{width}, height {height} (CameraModel.resized does it)",
+            f"{width}, height {height} (`lightdepth convert-camera FILE --size '[{width}, {height}]' -o NEW` does it)",
         )
     raise InputError(
         name,

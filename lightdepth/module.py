@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import lightning.pytorch as pl
 import torch
@@ -19,6 +19,7 @@ from lightdepth.losses import LossConfig, self_supervised_loss, training_loss
 from lightdepth.metrics import DepthErrors, inconsistency
 from lightdepth.network import Estimate, NetworkConfig, build_network, load_pretrained
 from lightdepth.network.model import full_precision
+from lightdepth.ranges import above, at_least
 
 _NETWORK, _LOSS = NetworkConfig(), LossConfig()
 MIN_RAY_Z = 0.15  # beyond 81 degrees from the axis, depth says little about distance
@@ -59,8 +60,8 @@ class LightDepth(pl.LightningModule):
         self,
         network: NetworkConfig = _NETWORK,
         loss: LossConfig = _LOSS,
-        learning_rate: float = 2e-3,
-        weight_decay: float = 1e-2,
+        learning_rate: Annotated[float, above(0, up_to=1)] = 2e-3,
+        weight_decay: Annotated[float, at_least(0)] = 1e-2,
         schedule: Literal["one_cycle", "cosine", "constant"] = "one_cycle",
         rows: int = 128,
         pretrained: str | None = None,

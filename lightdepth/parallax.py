@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -25,9 +26,11 @@ from scipy.spatial import cKDTree
 
 from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel
+from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.observations import ObservedDistances, sample_distance
 from lightdepth.prediction import DepthPrediction
+from lightdepth.ranges import Range, above, at_least, checked
 from lightdepth.sparse_map import Keyframe, Submap
 
 _GRID, _NEAREST = 24, 7
@@ -36,34 +39,39 @@ _BESIDE = 2.0  # pixels from the middle of a patch to the places that tell its s
 
 
 @dataclass(frozen=True)
+@checked
 class ParallaxConfig:
     """How the images measure distance."""
 
     on: bool = True
     """Whether distances measured between the images of keyframes (by parallax) help to judge bends and surface;
     switched off, only the map's points do."""
-    width: int = 320
+    width: Annotated[int, at_least(16, up_to=10_000)] = 320
     """Width to which wider images are shrunk before they are compared, pixels. A larger one measures finer and takes
     longer."""
-    across: int = 24
+    across: Annotated[int, at_least(1, up_to=10_000)] = 24
     """Number of cells across the image, and in proportion down; in each, the pixel with most texture is measured. More
     give more distances and take longer."""
-    neighbours: int = 4
+    neighbours: Annotated[int, at_least(1, up_to=1000)] = 4
     """Largest number of other keyframes that each is compared with. More make distances surer and take longer."""
-    patch: int = 7
+    patch: Annotated[int, at_least(3, up_to=255)] = 7
     """Side of the square patches of image that are compared, pixels, an odd number. A larger one needs less texture and
     blurs edges."""
-    angle: float = 12.0
+    angle: Annotated[float, above(0, up_to=180)] = 12.0
     """Parallax preferred in the choice of those keyframes, degrees: the angle between both cameras' rays to a shared
     point. A larger one measures distance more finely, between images that look less alike."""
-    least_angle: float = 2.0
+    least_angle: Annotated[float, at_least(0, up_to=180)] = 2.0
     """Parallax below which two keyframes are not compared, degrees. A larger one leaves out more pairs."""
-    least_score: float = 0.7
+    least_score: Annotated[float, Range(-1, 1)] = 0.7
     """Least correlation, at most 1, of a patch with what the other keyframes show of it, for its distance to count. A
     larger one gives fewer, surer distances."""
-    off_line: float = 1.0
+    off_line: Annotated[float, at_least(0)] = 1.0
     """Distance of what two keyframes both show from its epipolar line, the median in pixels, above which the images
     tell how the two stood to each other, in place of the map's poses. A larger one trusts the map's poses more."""
+
+    def __post_init__(self) -> None:
+        if self.patch % 2 == 0:
+            raise InputError("parallax.patch", f"{self.patch}", "expected an odd number, such as 7")
 
 
 @dataclass(frozen=True, repr=False)

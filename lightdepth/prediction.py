@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +11,8 @@ import numpy as np
 
 from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel, camera_from_params
-from lightdepth.errors import InputError
-
-_UNREADABLE = (OSError, EOFError, KeyError, ValueError, TypeError, AssertionError, zipfile.BadZipFile, zlib.error)
+from lightdepth.files.arrays import read_arrays
+from lightdepth.files.reading import reading
 
 
 @dataclass(frozen=True, repr=False)
@@ -85,21 +82,15 @@ def shrunk(prediction: DepthPrediction, camera: CameraModel) -> DepthPrediction:
 
 def read_prediction(path: str | Path) -> DepthPrediction:
     """A prediction from its .npz. Raises InputError when it is not one."""
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            meta = json.loads(str(data["meta"]))
-            arrays = {key: data[key] for key in data.files if key != "meta"}
+    cure = "expected an .npz made by `lightdepth predict`"
+    with reading(path, "a prediction", cure):
+        arrays = read_arrays(Path(path), "a prediction", cure)
+        meta = json.loads(str(arrays.pop("meta")))
         for key in arrays.keys() - {"valid"}:  # albedo and normals are stored in half precision
             arrays[key] = arrays[key].astype(np.float32)
         camera = meta["camera"]
-        return DepthPrediction(
-            name=meta["name"],
-            unit=meta["unit"],
-            source=meta["source"],
-            camera=camera_from_params(camera["model"], camera["width"], camera["height"], camera["params"], str(path)),
-            **arrays,
-        )
-    except _UNREADABLE as error:
-        raise InputError(
-            path, f"not a prediction ({error})", "expected an .npz made by `lightdepth predict`"
-        ) from error
+        lens = camera_from_params(camera["model"], camera["width"], camera["height"], camera["params"], str(path))
+        shape = (lens.height, lens.width)
+        if arrays["distance"].shape != shape or arrays["valid"].shape != shape or arrays["valid"].dtype != bool:
+            raise ValueError(f"arrays of other shapes than {lens.width}x{lens.height}")
+        return DepthPrediction(meta["name"], camera=lens, source=meta["source"], unit=meta["unit"], **arrays)

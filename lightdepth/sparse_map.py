@@ -18,6 +18,8 @@ from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.frame import frame_number
 
+_LARGEST = 1e12
+"""Magnitude of a coordinate beyond which a map is broken: its squares leave what distances are computed in."""
 _FAR = 100  # times the reach of a map that its middle lies away from the origin, from which it is far
 
 
@@ -33,6 +35,9 @@ class Keyframe(Brief):
 
     def __post_init__(self) -> None:
         check_rigid(self.cam_from_map, f"keyframe {self.name}")
+        if np.abs(self.cam_from_map[:3, 3]).max() > _LARGEST or np.abs(self.pixels).max(initial=0) > _LARGEST:
+            what = f"a place or a keypoint beyond {_LARGEST:g}"
+            raise InputError(f"keyframe {self.name[:80]}", what, "expected map units and pixels")
         if len(self.pixels) != len(self.point_ids):
             raise InputError(
                 f"keyframe {self.name}",
@@ -114,6 +119,13 @@ class Submap(Brief):
                 f"map {self.id}",
                 f"{len(bad)} points are not finite, the first is point {bad[0]}",
                 "expected finite X Y Z",
+            )
+        if np.abs(self.points).max() > _LARGEST:
+            far = self.point_ids[(np.abs(self.points) > _LARGEST).any(1)]
+            raise InputError(
+                f"map {self.id}",
+                f"{len(far)} points have coordinates beyond {_LARGEST:g}, the first is point {far[0]}",
+                "expected X Y Z in map units",
             )
         twice = sorted(n for n, times in Counter(k.number for k in self.keyframes).items() if times > 1)
         if twice:

@@ -19,6 +19,8 @@ from lightdepth.errors import InputError
 
 MAX_FRAME = 10**8
 """A month of video; a time of day in seconds or nanoseconds lies above."""
+_LATEST = 9e12
+"""Seconds whose microseconds are a number of 63 bits still."""
 _FOREIGN = 1e7  # seconds, from which times count from no video's beginning
 _BETWEEN, _ON_STAMP = 0.1, 0.05
 """Parts of a frame: from the first on, times fall between frames (median); up to the second, on a stamp (all)."""
@@ -53,6 +55,8 @@ class WhichFrame:
         folder, _, last = name.replace("\\", "/").rpartition("/")
         stem = _SUFFIX.sub("", last)
         time = _time_in(stem)
+        if time is not None and time > _LATEST:
+            raise InputError(name[:80], f"a time of {time:.3g} s in the name", f"expected at most {_LATEST:g} s")
         if time is not None:
             return cls(name, round(time / _MICROSECOND), time, folder)
         digits = re.findall(r"\d+", stem)
@@ -60,6 +64,10 @@ class WhichFrame:
             raise InputError(
                 name or "''", "no number in the name", "frames are matched with map entries by the integer in it"
             )
+        significant = digits[-1].lstrip("0")
+        if len(significant) > 18 and (len(significant) > 19 or int(significant) >= 2**63):
+            found = f"a number of {len(digits[-1])} digits in the name"
+            raise InputError(name if len(name) <= 80 else f"{name[:80]}...", found, "expected one below 2^63")
         unit = _UNITS.get(len(digits[-1])) if digits[-1][0] in "12" else None
         return cls(name, int(digits[-1]), None if unit is None else unit * int(digits[-1]), folder)
 

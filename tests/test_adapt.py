@@ -381,9 +381,9 @@ def test_the_loss_is_the_card_s_made_fit_for_frames_without_truth():
     ("options", "said"),
     [
         ({"checkpoint": "decline"}, "has no weights to adapt"),
-        ({"steps": 0}, "expected positive numbers"),
+        ({"steps": 0}, "expected a number"),
         ({"anchor": -1.0}, "anchor … -1.0"),
-        ({"held_out": 1.0}, "a share above 0 and below 1"),
+        ({"held_out": 1.0}, "above 0 and below 1"),
         ({"replay": 1, "batch_size": 1}, "batch_size of at least 2"),
         ({"data": Path("nowhere")}, "nowhere"),
         ({"map": Path("nowhere")}, "nowhere"),

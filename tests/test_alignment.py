@@ -175,7 +175,7 @@ def test_every_loss_finds_the_scale(loss):
 
 
 def test_a_threshold_that_is_none_is_refused():
-    with refused(where="alignment.t", found="0", cure="a positive number"):
+    with refused(where="AlignmentConfig.t", found="0", cure="above 0"):
         AlignmentConfig(t=0)
 
 

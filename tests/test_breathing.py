@@ -61,7 +61,7 @@ def test_a_map_of_a_breathing_colon_has_its_points_between_where_the_keyframes_s
 
 def test_what_cannot_breathe_is_refused():
     for changes in ({"amplitude": 0.5}, {"period": 0.0}, {"wavelength_mm": -1.0}):
-        with refused(where="breathing"):
+        with refused(where="BreathingConfig."):
             BreathingConfig(**changes)
     breathing = Breathing(colon(0).tube.shape, SLOW)
     with refused(where="--breathing.amplitude", cure="--slam.kind tracked"):

@@ -74,7 +74,7 @@ def test_a_camera_file_that_cannot_be_used_is_refused_by_name(tmp_path, message)
 def test_a_missing_file_and_one_that_is_no_text_are_refused_by_name(tmp_path):
     with refused(where="none.json", found="cannot be read (No such file"):
         read_json(tmp_path / "none.json")
-    with refused(found="cannot be read"):
+    with refused(found="a folder, not a file"):
         read_json(tmp_path)
     (tmp_path / "image.json").write_bytes(b"\x89PNG\xff\xfe")
     with refused(where="image.json", found="not UTF-8"):

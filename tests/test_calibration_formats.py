@@ -326,9 +326,9 @@ def test_an_image_or_a_folder_is_no_calibration(tmp_path):
     (tmp_path / "frame.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\xff")
     with refused(where="frame.png", found="not a text file", cure="expected camera.json"):
         read_camera(tmp_path / "frame.png")
-    with refused(found="cannot be read"):
+    with refused(found="a folder, not a file"):
         read_camera(tmp_path)
-    with refused(found="cannot be read"):
+    with refused(found="a folder, not a file"):
         read_light(tmp_path)
 
 

@@ -119,7 +119,7 @@ def test_the_verb_gives_a_file_its_size_and_refuses_another_aspect(tmp_path, cap
     assert read_camera(tmp_path / "camera.json") == SMALL["PINHOLE"]
     argv = ["convert-camera", str(tmp_path / "camera.json"), "-o", str(tmp_path / "small.yaml"), "--size"]
     assert main([*argv, "[48, 48]"]) == 3 and "is for 96x80; expected the same aspect" in capsys.readouterr().err
-    assert main([*argv, "[0, 0]"]) == 3 and "--size: [0, 0]; expected a width" in capsys.readouterr().err
+    assert main([*argv, "[0, 0]"]) == 3 and "--size: [0, 0]; expected each number" in capsys.readouterr().err
     assert main([*argv, "[48, 40]"]) == 0
     assert read_camera(tmp_path / "small.yaml").params == pytest.approx(SMALL["PINHOLE"].resized(48, 40).params)
 

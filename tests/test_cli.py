@@ -294,15 +294,15 @@ BAD_INPUT = {
     "format": (["densify", "DATA", "--map", "SLAM", "--formats", "[obj]", "--checkpoint", "decline"], "expected ply"),
     "scale": (
         ["densify", "DATA", "--map", "SLAM", "--mm_per_unit", "-1", "--checkpoint", "decline"],
-        "positive number",
+        "--mm-per-unit: -1.0; expected a number above 0",
     ),
     "light": (
         ["predict", "DATA", "--light", "gama=2", "--checkpoint", "decline"],
         "gama is not known (is gamma meant?)",
     ),
     "mask": (["predict", "DATA", "--mask", "NOWHERE", "--checkpoint", "decline"], "nowhere: no such mask"),
-    "frames": (["synth", "--frames", "0"], "--frames: 0; expected at least 1"),
-    "no pixels": (["synth", "--size", "[0, 0]"], "--size: [0, 0]; expected a width"),
+    "frames": (["synth", "--frames", "0"], "--frames: 0; expected a number from 1"),
+    "no pixels": (["synth", "--size", "[0, 0]"], "--size: [0, 0]; expected each number"),
     "too few frames": (["synth", "--frames", "2", "--size", "[24, 20]"], "render more frames"),
     "spurious": (["synth", "--spurious", "1.5"], "--spurious: 1.5"),
     "no run": (["evaluate", "NOWHERE", "--truth", "DATA"], "nowhere: no such folder"),
@@ -496,6 +496,23 @@ def test_doctor_finds_nothing_wrong_here(capsys):
     assert "FAIL" not in shown
     for what in ("python", "open3d", "pycolmap calls", "device", "fused plane"):
         assert f"ok    {what}" in shown
+
+
+def test_doctor_brings_back_what_a_killed_run_had_moved_aside_and_lists_what_it_left(tmp_path, monkeypatch, capsys):
+    import densify.doctor
+
+    monkeypatch.setattr(densify.doctor, "_fused_plane", lambda: densify.doctor.Check("fused plane", True, ""))
+    (tmp_path / "runs" / ".dense.old").mkdir(parents=True)
+    record = {"verb": "densify", "versions": {}, "files": {}}
+    (tmp_path / "runs" / ".dense.old" / "run.json").write_text(json.dumps(record))
+    (tmp_path / ".other.unfinished").mkdir()
+    (tmp_path / ".other.unfinished" / "begun.json").write_text("")
+    (tmp_path / ".config.old").mkdir()  # of another program
+    monkeypatch.chdir(tmp_path)
+    assert lightdepth("doctor") == 0
+    shown = capsys.readouterr().out
+    assert ".other.unfinished" in shown and ".config.old" not in shown and ".dense.old" not in shown
+    assert left_in(tmp_path / "runs") == ["dense"]
 
 
 def test_doctor_says_what_is_missing_and_how_to_get_it(capsys, monkeypatch):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
 import numba
 import numpy as np
 import pytest
-from numba.core.caching import CacheImpl
+from raising import warned
 
-from densify.fusion.compiled import compiled
+from densify.fusion import compiled as module
+from densify.fusion.compiled import cache_folder, compiled, open_to_others
 
 
 def twice(values):
@@ -18,12 +21,47 @@ def twice(values):
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason="Numba is off, to count lines")
-def test_machine_code_is_kept_beside_the_source_or_where_the_user_wants_it(tmp_path, monkeypatch):
+def test_machine_code_is_kept_where_the_user_wants_it(tmp_path, monkeypatch):
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
     assert compiled(twice)(np.arange(3)).tolist() == [0, 2, 4]
     assert [p.suffix for p in sorted(tmp_path.rglob("*twice*"))] == [".nbc", ".nbi"]
 
 
 def test_where_nothing_can_be_written_each_process_makes_its_own(monkeypatch):
-    monkeypatch.setattr(CacheImpl, "_locator_classes", [])  # none of the places can be written
+    monkeypatch.setattr(module._Place, "_locator_classes", [])  # none of the places can be written
     assert compiled(twice)(np.arange(3.0)).tolist() == [0, 2, 4]
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="Numba is off, to count lines")
+@pytest.mark.parametrize("damage", ["index cut", "code cut", "code of a bit less", "index of others", "a folder"])
+def test_damaged_machine_code_is_thrown_away_with_a_line_and_made_anew(damage, tmp_path, monkeypatch):
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
+    compiled(twice)(np.arange(3))
+    (index,), (code,) = tmp_path.rglob("*.nbi"), tmp_path.rglob("*.nbc")
+    file = index if damage.startswith("index") else code
+    content = file.read_bytes()
+    changed = bytes([content[-40] ^ 1])
+    made = {"index cut": content[:-20], "code cut": content[: len(content) // 2], "index of others": b"none"}
+    if damage == "a folder":
+        code.unlink()
+        code.mkdir()
+        assert compiled(twice)(np.arange(3)).tolist() == [0, 2, 4]
+        return
+    file.write_bytes(made.get(damage, content[:-40] + changed + content[-39:]))
+    with warned("damaged"):
+        assert compiled(twice)(np.arange(3)).tolist() == [0, 2, 4]
+    again = compiled(twice)
+    assert again(np.arange(3)).tolist() == [0, 2, 4] and sum(again.stats.cache_hits.values()) == 1
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT or os.name == "nt", reason="needs Numba and modes of files")
+def test_the_users_own_folder_is_closed_to_others_and_one_that_is_not_is_not_used(tmp_path, monkeypatch):
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    compiled(twice)(np.arange(3))
+    assert cache_folder() == tmp_path / "lightdepth" / "compiled"
+    assert cache_folder().stat().st_mode & 0o777 == 0o700 and len(list(tmp_path.rglob("*.nbc"))) == 1
+    cache_folder().chmod(0o777)
+    again = compiled(twice)
+    assert open_to_others(cache_folder()) and again(np.arange(3)).tolist() == [0, 2, 4]
+    assert not again.stats.cache_hits

@@ -356,9 +356,9 @@ def test_truth_that_does_not_fit_is_refused_and_nothing_is_written(run, predicti
 
 def test_options_that_mean_nothing_are_refused(run, data, tmp_path):
     for options, message in (
-        ({"mm_per_unit": 0.0}, "expected a positive number of millimetres"),
-        ({"thresholds_mm": ()}, "expected positive distances"),
-        ({"thresholds_mm": (1.0, -2.0)}, "expected positive distances"),
+        ({"mm_per_unit": 0.0}, "above 0"),
+        ({"thresholds_mm": ()}, "expected distances in mm"),
+        ({"thresholds_mm": (1.0, -2.0)}, "each number above 0"),
     ):
         with refused(message):
             evaluate(run, data, tmp_path / "out", **options)

@@ -283,11 +283,11 @@ def test_frames_are_chosen_by_time_and_what_is_blurred_frozen_or_unreadable_is_n
     [
         ({"rate": 2.0, "every": 3}, "give one of them"),
         ({"rate": 0.0}, "above 0"),
-        ({"every": 0}, "1 or more"),
+        ({"every": 0}, "at least 1"),
         ({"blur": 1.0}, "below 1"),
         ({"start": 2.0, "end": 1.0}, "an end after the start"),
         ({"start": 99.0}, "no frames between"),
-        ({"size": (0, 5)}, "positive width"),
+        ({"size": (0, 5)}, "from 1 to"),
     ],
 )
 def test_wrong_options_are_refused_and_leave_nothing(sources, tmp_path, options, message):

@@ -126,7 +126,7 @@ def test_the_judge_can_be_switched_off_and_the_images_left_out(submap, frames):
 
 
 def test_fewer_than_two_folds_are_refused():
-    with refused(where="judge.folds", found="1", cure="at least 2"):
+    with refused(where="JudgeConfig.folds", found="1", cure="from 2"):
         JudgeConfig(folds=1)
 
 

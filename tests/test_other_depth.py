@@ -188,11 +188,11 @@ def test_depth_files_that_would_hang_or_take_all_memory_are_refused_at_once(data
     for folder in (pipes, huge):
         folder.mkdir()
     os.mkfifo(pipes / "0.exr")
-    assert "a named pipe or a device" in refusal(pipes)
+    assert "a named pipe" in refusal(pipes)
     with (huge / "0.npy").open("wb") as stream:
         shape = {"descr": "<f4", "fortran_order": False, "shape": (10**7, 10**7)}
         np.lib.format.write_array_header_1_0(stream, shape)
-    assert "not an array" in refusal(huge)
+    assert "an array of 10000000x10000000" in refusal(huge)
 
 
 def test_a_scale_beyond_what_32_bits_hold_is_refused_without_a_warning_of_numpy(data, distances, tmp_path, capsys):

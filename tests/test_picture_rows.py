@@ -181,7 +181,7 @@ def test_a_named_pipe_among_the_frames_is_refused_not_waited_for(tmp_path, capsy
     data = write(tmp_path / "data", None, count=2)
     os.mkfifo(data / "frames" / "000002.png")
     for verb in ("predict", "import"):
-        assert "000002.png: a named pipe or a device" in refusal(capsys, verb, data, "-o", tmp_path / "no")
+        assert "000002.png: a named pipe" in refusal(capsys, verb, data, "-o", tmp_path / "no")
 
 
 def test_a_folder_without_pictures_is_named_as_the_one_that_was_looked_in(tmp_path, capsys):

@@ -76,7 +76,6 @@ def broken_meta(**changes) -> np.ndarray:
 
 
 CORRUPT = {
-    "missing": lambda path: None,
     "empty": lambda path: path.write_bytes(b""),
     "text": lambda path: path.write_text("distance 12"),
     "truncated": lambda path: (full_prediction().save(path), path.write_bytes(path.read_bytes()[:2000])),
@@ -98,6 +97,11 @@ def test_a_file_that_is_no_prediction_is_refused_by_name(tmp_path, how):
     CORRUPT[how](path)
     with refused(where="bad.npz", found="not a prediction", cure="`lightdepth predict`"):
         read_prediction(path)
+
+
+def test_a_prediction_that_is_not_there_is_refused_by_name(tmp_path):
+    with refused(where="none.npz", found="cannot be read"):
+        read_prediction(tmp_path / "none.npz")
 
 
 def test_bytes_gone_bad_inside_the_file_are_refused(tmp_path):

@@ -27,8 +27,9 @@ from densify.evaluation.errors import (
 from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import JudgedMap
 from densify.evaluation.trajectory import in_order
-from densify.evaluation.truth import Truth, read_mesh, read_truth
+from densify.evaluation.truth import Truth, read_truth
 from densify.similarity import Similarity
+from lightdepth.files.meshes import read_mesh
 
 THRESHOLDS = (0.5, 1.0, 2.0)
 

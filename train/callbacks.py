@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import lightning.pytorch as pl
 import numpy as np
@@ -21,6 +21,7 @@ from lightdepth.losses import masked_median, render_image
 from lightdepth.losses.masked import masked_std
 from lightdepth.module import LightDepth
 from lightdepth.photometry import brightness
+from lightdepth.ranges import at_least, checked
 
 
 class Panels(pl.Callback):
@@ -92,16 +93,17 @@ class TrainingProgress(pl.Callback):
 
 
 @dataclass(frozen=True)
+@checked
 class DiagnosisConfig:
     """When a run that goes nowhere is stopped."""
 
-    patience: int = 10
+    patience: Annotated[int, at_least(1)] = 10
     """Number of steps in a row whose loss or gradient is infinite or not a number, after which the run is stopped with
     an error; until then such steps are skipped. More wait longer."""
-    blind: int = 50
+    blind: Annotated[int, at_least(1)] = 50
     """Number of batches in a row in which every pixel is black, saturated or masked, after which the run is stopped
     with an error. More wait longer."""
-    constant: int = 200
+    constant: Annotated[int, at_least(1)] = 200
     """Number of batches in a row in which the network gives nearly one distance everywhere although brightness varies,
     after which the run is stopped with an error. More wait longer."""
 

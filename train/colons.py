@@ -3,44 +3,46 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 
 from lightdepth.frame import FrameBatch, to_batch
+from lightdepth.ranges import BELOW_ONE, COUNT, Range, at_least, checked, ends_of
 from lightdepth.tube.path import Lens
 from lightdepth.tube.scene import TubeConfig
 
 
 @dataclass(frozen=True)
+@checked
 class TubeData:
     """Synthetic colons for training, drawn from the data's seed; validation scenes are others."""
 
-    scenes: int = 0
+    scenes: Annotated[int, at_least(0, up_to=1_000_000)] = 0
     """Number of synthetic colons to train on, each with its own shape, texture and endoscope; 0 for none. More show the
     network more variety, and take longer to render."""
-    val_scenes: int = 0
+    val_scenes: Annotated[int, at_least(0, up_to=1_000_000)] = 0
     """Number of synthetic colons to validate on, others than those to train on; 0 for none. More judge more surely and
     take longer."""
-    frames: int = 8
+    frames: Annotated[int, COUNT] = 8
     """Number of frames rendered of each colon, to train and to validate on. More show more of each colon and take
     longer to render."""
-    travel: float = 60.0
+    travel: Annotated[float, at_least(0, up_to=10_000)] = 60.0
     """Length of the endoscope's way through each colon, mm, over which its frames are spread evenly. A longer one makes
     neighbouring frames less alike."""
     lenses: tuple[Lens, ...] = ("c3vd", "fisheye", "pinhole")
     """Lenses that the colons get in turn, a list: pinhole (90 degrees wide, no distortion), telescope (70 degrees, no
     distortion), fisheye (136 degrees), c3vd (that of the data set C3VD). Each lens that is left out is one that the
     network never sees."""
-    mu: tuple[float, float] = (0.0, 3.5)
+    mu: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (0.0, 3.5)
     """Range [low, high] from which each colon's exponent mu is drawn: light falls off by exp(-mu (1 - cos a)) at the
     angle a from its axis, and at 0 not at all. A larger one makes a narrower light, with darker borders of the
     image."""
-    gamma: tuple[float, float] = (1.8, 2.6)
+    gamma: Annotated[tuple[float, float], ends_of(Range(0.1, 10))] = (1.8, 2.6)
     """Range [low, high] from which each colon's exponent gamma is drawn: the camera writes the light v as v^(1/gamma),
     and 1 is linear. A larger one brightens dark parts more."""
-    reflectance: tuple[float, float] = (0.0, 0.7)
+    reflectance: Annotated[tuple[float, float], ends_of(BELOW_ONE)] = (0.0, 0.7)
     """Range [low, high] from which each colon's reflectance is drawn, the share of light, in [0, 1), that its wall
     throws back onto other wall. A larger one makes more indirect light."""
     family: Literal["plain", "realistic", "mixed"] = "plain"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Annotated, cast
 
 import lightning.pytorch as pl
 import numpy as np
@@ -24,6 +24,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, flipped, to_batch
 from lightdepth.losses import LossConfig
 from lightdepth.photometry import LightTerms, brightness, decode, encode
+from lightdepth.ranges import BELOW_ONE, BETWEEN, SEED, Range, at_least, checked, ends_of
 from lightdepth.reporting.progress import Progress
 from train.colons import TubeData, colon_seeds, tube_scene, with_reflectance
 from train.frame_lists import Listed, listed_rows, open_listed
@@ -35,6 +36,7 @@ _LOOKED_AT = 256  # frames whose colours are looked at, of all sequences togethe
 
 
 @dataclass(frozen=True)
+@checked
 class FrameData:
     """Which frames are trained and validated on, and how they are shown to the network."""
 
@@ -64,10 +66,10 @@ class FrameData:
     mask: str | None = None
     """Image, white where tissue shows and black elsewhere, for all the sequences in place of their own masks. Left out,
     each has its own, if any."""
-    bit_depth: int | None = None
+    bit_depth: Annotated[int | None, Range(8, 32)] = None
     """Bits of a sample in pictures that are stored in more than 8, of all the sequences; left out, what the files say,
     else what their highest values show. A larger one reads the same numbers as darker."""
-    held_out: float = 0.1
+    held_out: Annotated[float, BETWEEN] = 0.1
     """Share of each training sequence, above 0 and below 1, at its end, that validates and teaches nothing, where no
     validation sequences are given. A larger one judges more surely and trains on less."""
     tube: TubeData = _NO_TUBE
@@ -76,43 +78,33 @@ class FrameData:
     """true: one half of each batch is frames of the sequences, the other of synthetic colons (of an odd number the
     sequences have one more). false: all are shuffled together, so that there are most of what has most frames. Without
     both kinds it changes nothing."""
-    size: tuple[int, int] = (160, 128)
+    size: Annotated[tuple[int, int], at_least(16, up_to=10_000)] = (160, 128)
     """Width and height that the images are resized to, pixels, to train, validate and predict at. A larger one shows
     finer detail and takes longer."""
-    batch_size: int = 4
+    batch_size: Annotated[int, at_least(1, up_to=100_000)] = 4
     """Number of frames in a batch, from which the network learns at once. More make steadier steps and take more time
     and memory."""
-    num_workers: int = 0
+    num_workers: Annotated[int, at_least(0, up_to=1024)] = 0
     """Number of extra processes that read frames; with 0 the main one reads them itself, between steps. More read
     faster, as far as there are cores."""
     augment: bool = True
     """true: training images are flipped at random, and made brighter or darker by some 10 %. false: they are shown as
     they are. Validation images are never changed."""
-    reflectance_error: float = 0.0
+    reflectance_error: Annotated[float, Range(-1, 1)] = 0.0
     """Number added to the known reflectance of each image (the share of light that the wall throws back; the sum is
     kept in [0, 0.95]), to try what a wrong calibration costs; 0 adds nothing. A larger one makes it more wrong. Only
     --model.loss.reflectance null, or reflectance among --model.network.inputs, lets it have an effect."""
-    random_reflectance: tuple[float, float] | None = None
+    random_reflectance: Annotated[tuple[float, float] | None, ends_of(BELOW_ONE)] = None
     """Range [low, high] of shares in [0, 1), from which the reflectance told of each training image (the share of light
     that the wall throws back) is drawn anew in every step; left out, the known one is told. A larger one tells of more
     indirect light. Like reflectance_error, it acts through --model.loss.reflectance null or the network's input
     alone."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Number that draws colons, order and augmentation. Another one makes another run."""
 
     def __post_init__(self) -> None:
-        if self.random_reflectance is not None:
-            low, high = self.random_reflectance
-            if not 0 <= low <= high < 1:
-                raise InputError(
-                    "data", f"random_reflectance {self.random_reflectance}", "expected 0 <= low <= high < 1"
-                )
-        if not 0 < self.held_out < 1:
-            raise InputError("data", f"held_out {self.held_out}", "expected a share above 0 and below 1")
         if self.halves and self.batch_size < 2:
             raise InputError("data", "halves of a batch of one", "expected a batch_size of at least 2")
-        if min(*self.size, self.batch_size) < 1:
-            raise InputError("data", f"size {self.size}, batch_size {self.batch_size}", "expected positive numbers")
         if self.split is not None and (self.sequences or self.val_sequences):
             raise InputError("data", "a split and sequences", "give --data.split FILE or --data.sequences, not both")
         if (self.split is None) != (self.root is None):

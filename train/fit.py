@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import lightning.pytorch as pl
 import torch
@@ -29,7 +29,7 @@ from lightning.pytorch.callbacks import (
     ModelCheckpoint,
     RichProgressBar,
 )
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from lightdepth.checkpoint import load_model, save_model
@@ -38,6 +38,7 @@ from lightdepth.files.writing import write_whole
 from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
+from lightdepth.ranges import BELOW_ONE, at_least, checked
 from lightdepth.reporting.run import input_hash, versions, write_run_json
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
@@ -49,34 +50,40 @@ from .running import quiet, report_every
 from .trainer_options import check_trainer_options
 
 _OURS = (
-    *("config.yaml", "log.txt", "tensorboard", "checkpoints", "model.safetensors", "model.md", "uncertainty.png"),
+    *(
+        "config.yaml",
+        "log.txt",
+        "tensorboard",
+        "csv",
+        "checkpoints",
+        "model.safetensors",
+        "model.md",
+        "uncertainty.png",
+    ),
     "run.json",
 )
 _PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mixed")
 
 
 @dataclass(frozen=True)
+@checked
 class FitConfig:
     """How a run is watched, averaged and stopped."""
 
-    ema: float = 0.0
+    ema: Annotated[float, BELOW_ONE] = 0.0
     """Decay of the running average of the weights, in [0, 1), which is validated and exported in place of the last
     weights; 0 takes no average. A larger one averages over more steps, about 1 / (1 - decay) of them."""
     monitor: Literal["loss", "photometric", "inconsistency", "last"] = "loss"
     """What must be least, on the validation frames, in the checkpoint that is exported; it needs no truth: the whole
     "loss"; its "photometric" term (rendered against seen light); or the "inconsistency" (how much distance changes when
     the image is mirrored and darkened). "last" exports the last step, whatever these say."""
-    patience: int = 0
+    patience: Annotated[int, at_least(0)] = 0
     """Number of validations in a row without a better value of --fit.monitor after which the run ends; 0 goes on to the
     last step. More wait longer."""
     diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
     """When a run that goes nowhere is stopped."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.ema < 1 or self.patience < 0:
-            raise InputError(
-                "fit", f"ema {self.ema}, patience {self.patience}", "expected 0 <= ema < 1 and patience >= 0"
-            )
         if self.patience and self.monitor == "last":
             raise InputError(
                 "fit", "patience without a criterion", "set fit.monitor to loss, photometric or inconsistency"
@@ -279,8 +286,7 @@ def _with_callbacks(
     steps = asked if isinstance(asked, int) and asked else -1
     if isinstance(interval, int) and 0 < steps < interval:
         options["val_check_interval"] = interval = steps  # a short run is validated once, at its end
-    if options.get("logger") in (None, True):
-        options["logger"] = TensorBoardLogger(str(output), name="tensorboard", version="")
+    options["logger"] = _logger(options.get("logger"), output)
     folder = str(output / "checkpoints")
     monitor = f"val/{settings.monitor}"
     best = (
@@ -316,6 +322,15 @@ def _with_callbacks(
     options["callbacks"] = [*(callbacks if isinstance(callbacks, list) else [callbacks]), *extra]
     options.setdefault("default_root_dir", str(output))
     return options
+
+
+def _logger(asked: object, output: Path) -> object:
+    """What logs a run, by our names; a logger of Lightning's, given from code, as it is."""
+    if asked in (None, True, "tensorboard"):
+        return TensorBoardLogger(str(output), name="tensorboard", version="")
+    if asked == "csv":
+        return CSVLogger(str(output), name="csv", version="")
+    return False if asked == "none" else asked
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,12 @@ from pathlib import Path
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.splits import Chosen, Split
 from lightdepth.errors import InputError
+from lightdepth.regular import regular
 
 
 def read_frame_list(path: Path) -> list[str]:
     """Frame names, one a line; empty lines and lines that start with # are skipped."""
+    regular(path)
     try:
         lines = [line.strip() for line in path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()]
     except (OSError, UnicodeDecodeError) as error:

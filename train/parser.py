@@ -5,23 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from lightdepth.command_line.pages import PAGES
+from lightdepth.ranges import SEED
 
-from .trainer_options import TRAINER_OPTIONS, WITHOUT
+from .trainer_options import TrainerSettings
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
     from lightdepth.command_line.parsing import Parser
-
-TRAINER_DEFAULTS = {
-    "trainer.max_steps": 1500,
-    "trainer.val_check_interval": 250,
-    "trainer.check_val_every_n_epoch": None,  # so that the interval counts steps, not epochs
-    "trainer.num_sanity_val_steps": 0,
-    "trainer.gradient_clip_val": 1.0,
-    "trainer.log_every_n_steps": 10,
-    "trainer.enable_model_summary": False,
-}
 
 _OUTPUT = "Folder of the run to make: checkpoints, model.safetensors, logs and run.json."
 _RESUME = """Go on with the run in OUTPUT from its checkpoints/last.ckpt, with its own config.yaml where no other is
@@ -33,10 +24,9 @@ Another one makes another run, better or worse by chance alone."""
 
 def training_parser() -> Parser:
     """Every option of a training run: of the model, its data, how it is watched, and Lightning's Trainer."""
-    import lightning.pytorch as pl
-
     from lightdepth.command_line.parsing import Parser, finish
     from lightdepth.command_line.presets import preset_help
+    from lightdepth.command_line.ranges import below, ranges_in
     from lightdepth.module import LightDepth
 
     from .datamodule import FrameData
@@ -53,16 +43,16 @@ def training_parser() -> Parser:
     parser.add_class_arguments(LightDepth, "model")
     parser.add_class_arguments(FrameData, "data")
     parser.add_class_arguments(FitConfig, "fit")
-    parser.add_class_arguments(pl.Trainer, "trainer", instantiate=False, skip=WITHOUT)
+    parser.add_class_arguments(TrainerSettings, "trainer")
     parser.link_arguments("seed", "data.seed")
     parser.link_arguments("data.size", "model.rows", compute_fn=lambda size: size[1])
-    parser.set_defaults(TRAINER_DEFAULTS)
-    for action in parser._actions:
-        action.help = TRAINER_OPTIONS.get(action.dest, action.help)
     assert parser.groups is not None
     parser.groups["model"].title = "How the network learns, and from which weights"
     parser.groups["trainer"].title = "Lightning's Trainer: device, length of the run, and what is logged"
-    finish(parser, PAGES["train"])
+    ranges = {"seed": SEED}
+    for group, made in (("model", LightDepth), ("data", FrameData), ("fit", FitConfig), ("trainer", TrainerSettings)):
+        ranges |= below(group, ranges_in(made))
+    finish(parser, PAGES["train"], ranges)
     return parser
 
 

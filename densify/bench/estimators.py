@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
+from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least, checked
 from lightdepth.reporting.figures import chart_png
 from lightdepth.robust import lmeds_scale
 from lightdepth.sparse_map import Keyframe
@@ -45,29 +46,28 @@ _REACH = 2.5
 
 
 @dataclass(frozen=True)
+@checked
 class EstimatorsConfig:
     """Shares of wrong points, their kinds, points per keyframe, and keyframes drawn for each combination."""
 
-    shares: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6)
+    shares: Annotated[tuple[float, ...], BELOW_ONE] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6)
     """Shares of wrong points, each judged on its own. More shares take longer."""
     kinds: tuple[Kind, ...] = ("uniform", "clustered", "depth")
     """Kinds of wrong points: uniform, clustered, depth."""
-    points: tuple[int, ...] = (20, 100, 500)
+    points: Annotated[tuple[int, ...], at_least(8, up_to=1_000_000)] = (20, 100, 500)
     """Numbers of points per keyframe, each judged on its own. More numbers take longer."""
-    draws: int = 50
+    draws: Annotated[int, COUNT] = 50
     """Number of keyframes drawn for each combination. More make the figures more certain and take longer."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Number that draws the keyframes and their points. Another one draws others."""
 
     def __post_init__(self) -> None:
-        if not self.shares or not all(0 <= share < 1 for share in self.shares):
+        if not self.shares:
             raise InputError("shares", f"{list(self.shares)}", "expected shares of at least 0 and below 1")
         if not self.kinds or set(self.kinds) - set(get_args(Kind)):
             raise InputError("kinds", f"{list(self.kinds)}", f"expected some of {', '.join(get_args(Kind))}")
-        if not self.points or min(self.points) < 8:
+        if not self.points:
             raise InputError("points", f"{list(self.points)}", "expected numbers of at least 8")
-        if self.draws < 1:
-            raise InputError("draws", f"{self.draws}", "expected at least 1")
 
 
 @dataclass(frozen=True)

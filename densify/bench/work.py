@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.models import DepthModel
 from lightdepth.prediction import DepthPrediction
+from lightdepth.ranges import BELOW_ONE, SEED, at_least, checked
 from lightdepth.sparse_map import Submap
 
 SPARSE, INLIERS = "sparse map", "sparse inliers"
@@ -38,17 +40,18 @@ IMAGE_SIZE: dict[Size, tuple[int, int]] = {"small": (160, 128), "full": (320, 25
 
 
 @dataclass(frozen=True)
+@checked
 class BenchConfig:
     """What the benchmark measures."""
 
     size: Size = "small"
     """How much is measured: small, or full, with more and longer sequences and a screening."""
-    first_seed: int = 400
+    first_seed: Annotated[int, SEED] = 400
     """Number that seeds the first scene; the others count on from it. Another one draws other colons."""
-    wrong_shares: tuple[float, ...] = SHARES["small"]
+    wrong_shares: Annotated[tuple[float, ...], BELOW_ONE] = SHARES["small"]
     """Shares of wrong map points, each a SLAM export of its own; the screening has one of its
     own, screening_share. More shares take longer."""
-    screening_share: float = 0.3
+    screening_share: Annotated[float, BELOW_ONE] = 0.3
     """Share of wrong map points of the screening, which is ten times as long as the other scenes and so is judged at
     one share only. A larger one makes it harder."""
     checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT)
@@ -58,7 +61,7 @@ class BenchConfig:
     cases: tuple[Case, ...] = ()
     """Map errors that come together (densify.bench.cases), each a cell of its own in the short sequences, made dense by
     the last model with one scale a keyframe and in full. More cases take longer."""
-    image_size: tuple[int, int] = IMAGE_SIZE["small"]
+    image_size: Annotated[tuple[int, int], at_least(32, up_to=10_000)] = IMAGE_SIZE["small"]
     """Width and height of the keyframes, pixels. A larger one takes longer."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     """How dense maps are made, for all dense rows but for their recipe."""
@@ -68,12 +71,6 @@ class BenchConfig:
             given = getattr(self, name)
             if (not given and name != "cases") or len(set(given)) < len(given):
                 raise InputError(name, f"{list(given)}", "expected at least one, and none twice")
-        if not all(0 <= share < 1 for share in (*self.wrong_shares, self.screening_share)):
-            raise InputError("wrong_shares", f"{list(self.wrong_shares)}", "expected shares of at least 0 and below 1")
-        if min(self.image_size) < 32:
-            raise InputError("image_size", f"{list(self.image_size)}", "expected at least 32 pixels each way")
-        if self.first_seed < 0:
-            raise InputError("first_seed", f"{self.first_seed}", "expected 0 or more")
 
     def shares(self, scene: Scene) -> tuple[float, ...]:
         return self.wrong_shares if scene.maps == 1 else (self.screening_share,)

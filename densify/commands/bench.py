@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 from densify.bench.cases import USUAL_CASES, Case
 from densify.bench.estimators import (
@@ -26,8 +27,10 @@ from densify.config import DensifyConfig, OfflineConfig, Recipe
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
+from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
 from lightdepth.models import DepthModel
+from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, git_revision, plain, recorded, run_folder, versions
 
@@ -45,12 +48,12 @@ def bench(argv: list[str]) -> int:
 def run(
     output: Path = Path("runs/bench"),
     size: Size = "small",
-    first_seed: int = 400,
-    wrong_shares: tuple[float, ...] | None = None,
+    first_seed: Annotated[int, SEED] = 400,
+    wrong_shares: Annotated[tuple[float, ...] | None, BELOW_ONE] = None,
     checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT),
     recipes: tuple[Recipe, ...] = ("paper", "full"),
     cases: tuple[Case, ...] | None = None,
-    image_size: tuple[int, int] | None = None,
+    image_size: Annotated[tuple[int, int] | None, at_least(32, up_to=10_000)] = None,
     method: Group[OfflineConfig] = OfflineConfig(),
     overwrite: bool = False,
 ) -> None:
@@ -123,7 +126,7 @@ def _cells(config: BenchConfig, models: Sequence[DepthModel]) -> tuple[list[Cell
     return cells, seconds
 
 
-def compare_runs(a: Path, b: Path, output: Path | None = None, seed: int = 0) -> None:
+def compare_runs(a: Path, b: Path, output: Path | None = None, seed: Annotated[int, SEED] = 0) -> None:
     """Whether run B is better or worse than run A, or within noise; paired where the scenes are the same.
 
     Args:
@@ -133,6 +136,8 @@ def compare_runs(a: Path, b: Path, output: Path | None = None, seed: int = 0) ->
         seed: Number that draws the bootstrap samples, by which noise is told from difference. Another one gives
             slightly different intervals.
     """
+    if output is not None:
+        check_rewritable(output, '{\n "kind": "bench comparison"', [a, b])
     found = compare(read_bench(a), read_bench(b), seed)
     print(found.markdown(str(a), str(b)))
     if output is not None:
@@ -142,10 +147,10 @@ def compare_runs(a: Path, b: Path, output: Path | None = None, seed: int = 0) ->
 
 def compare_estimators(
     output: Path = Path("runs/estimators"),
-    shares: tuple[float, ...] = EstimatorsConfig.shares,
-    points: tuple[int, ...] = EstimatorsConfig.points,
-    draws: int = 50,
-    seed: int = 0,
+    shares: Annotated[tuple[float, ...], BELOW_ONE] = EstimatorsConfig.shares,
+    points: Annotated[tuple[int, ...], at_least(8, up_to=1_000_000)] = EstimatorsConfig.points,
+    draws: Annotated[int, COUNT] = 50,
+    seed: Annotated[Annotated[int, SEED], SEED] = 0,
     overwrite: bool = False,
 ) -> None:
     """Estimators of a keyframe's scale side by side, by share, kind and number of wrong points.

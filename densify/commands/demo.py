@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
@@ -14,6 +15,7 @@ from densify.page import densify_page
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import open_sequence
 from lightdepth.maps import read_map
+from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import Lens, render_sequence
@@ -25,11 +27,11 @@ from lightdepth.tube.slam import SlamConfig, simulate_slam
 def demo(
     output: Path = Path("runs/demo"),
     checkpoint: str = DEFAULT_CHECKPOINT,
-    frames: int = 40,
-    seed: int = 7,
-    size: tuple[int, int] = (320, 256),
+    frames: Annotated[int, COUNT] = 40,
+    seed: Annotated[int, SEED] = 7,
+    size: Annotated[tuple[int, int], at_least(8, up_to=10_000)] = (320, 256),
     lens: Lens = "c3vd",
-    spurious: float = 0.3,
+    spurious: Annotated[float, BELOW_ONE] = 0.3,
     overwrite: bool = False,
 ) -> None:
     """The whole way on a synthetic colon: render, sparse map, densify, evaluate; ends at report.html.

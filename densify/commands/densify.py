@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
@@ -14,6 +14,7 @@ from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
+from lightdepth.ranges import above
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
 
@@ -26,7 +27,7 @@ def densify(
     config: Group[DensifyConfig] = DensifyConfig(),
     sfm: SfmConfig = SfmConfig(),
     formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply",),
-    mm_per_unit: float | None = None,
+    mm_per_unit: Annotated[float | None, above(0)] = None,
     fit_light: bool = True,
     merge: bool = True,
     merging: MergeConfig = MergeConfig(),

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from densify.dense_map import map_folders
 from densify.exporting.work import MAP_KINDS, MapExport, export_maps
 from lightdepth.checkpoint import load_model
 from lightdepth.command_line.options import Group
-from lightdepth.errors import InputError
+from lightdepth.errors import InputError, MissingOption
 from lightdepth.exporting.work import DEPTH_KINDS, MODEL_KINDS, export_depth, export_model
 from lightdepth.models import NetworkModel
+from lightdepth.ranges import PIXELS, above
 from lightdepth.reporting.run import recorded, run_folder
 
 Kind = Literal[
@@ -24,9 +25,9 @@ def export(
     output: Path,
     to: Kind | None = None,
     maps: Group[MapExport] = MapExport(),
-    size: tuple[int, int] | None = None,
+    size: Annotated[tuple[int, int] | None, PIXELS] = None,
     half: bool = True,
-    step: float | None = None,
+    step: Annotated[float | None, above(0)] = None,
     overwrite: bool = False,
 ) -> None:
     """Dense maps, predictions or a checkpoint as other programs take them: COLMAP, nerfstudio, meshes, ONNX.
@@ -47,7 +48,7 @@ def export(
     arguments = recorded(maps, what=what, output=output, to=to, size=size, half=half, step=step)
     path = Path(what)
     if to is None:
-        raise InputError("--to", "not given", f"expected one of {', '.join(get_args(Kind))}")
+        raise MissingOption("--to", "not given", f"expected one of {', '.join(get_args(Kind))}")
     if to not in get_args(MODEL_KINDS) and not path.exists():  # a checkpoint may be a name
         raise InputError(path, "does not exist", "expected a run of densify, a map folder, or a folder of predict")
     if to in get_args(MAP_KINDS) and not map_folders(path):

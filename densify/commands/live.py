@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 from densify.config import LiveConfig
 from densify.inputs import MapSource, check_unit, doubts_of_inputs, fitted_light, map_and_frames
@@ -12,6 +13,7 @@ from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
+from lightdepth.ranges import above, at_least
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
@@ -22,11 +24,11 @@ def live(
     output: Path,
     mapped: Group[MapSource] = MapSource(),
     checkpoint: str = DEFAULT_CHECKPOINT,
-    rate: float | None = None,
-    budget_ms: float = 200.0,
+    rate: Annotated[float | None, at_least(0.01, up_to=10_000)] = None,
+    budget_ms: Annotated[float, above(0)] = 200.0,
     config: Group[LiveConfig] = LiveConfig(),
     sfm: SfmConfig = SfmConfig(),
-    mm_per_unit: float | None = None,
+    mm_per_unit: Annotated[float | None, above(0)] = None,
     fit_light: bool = True,
     overwrite: bool = False,
 ) -> None:

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from densify.evaluation.judged_map import read_run
 from densify.measure import chosen_map, measured, places_in_frame, run_unit
 from lightdepth.errors import InputError
+from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
+from lightdepth.ranges import ANY, above, at_least
 from lightdepth.reporting.run import plain
 
 
 def measure(
     run: Path,
-    points: list[tuple[float, float, float]] | None = None,
-    frame: int | None = None,
-    pixels: list[tuple[float, float]] | None = None,
-    radius: float | None = None,
-    map: int | None = None,
-    mm_per_unit: float | None = None,
+    points: Annotated[list[tuple[float, float, float]] | None, ANY] = None,
+    frame: Annotated[int | None, at_least(0, up_to=1e19)] = None,
+    pixels: Annotated[list[tuple[float, float]] | None, ANY] = None,
+    radius: Annotated[float | None, above(0)] = None,
+    map: Annotated[int | None, at_least(0)] = None,
+    mm_per_unit: Annotated[float | None, above(0)] = None,
     output: Path | None = None,
 ) -> None:
     """Lengths and areas on a surface of a densify run: between two places, around one, inside an outline of more.
@@ -44,6 +47,8 @@ def measure(
             in mm. A larger one makes them longer in proportion. It is refused where the surface is in mm already.
         output: JSON file to write the lengths and areas to, besides showing them. Left out, they are shown only.
     """
+    if output is not None:
+        check_rewritable(output, '{\n "run": ', [run])
     dense = chosen_map(read_run(run), map, run)
     unit = run_unit(run, mm_per_unit)
     if (points is None) == (pixels is None) or (pixels is None) != (frame is None):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
 from lightdepth.frame import frame_number
 from lightdepth.maps.convention import MapConvention, MapReading
+from lightdepth.ranges import Range
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.made import made_sparse
@@ -25,9 +27,9 @@ def sparse(
     output: Path,
     format: FormatName | None = None,
     camera: Path | None = None,
-    fov: float | None = None,
+    fov: Annotated[float | None, Range(10, 175)] = None,
     mask: Path | None = None,
-    bit_depth: int | None = None,
+    bit_depth: Annotated[int | None, Range(8, 32)] = None,
     poses: str | None = None,
     repair: Path | None = None,
     sfm: SfmConfig = SfmConfig(),

@@ -12,12 +12,10 @@ than the frame, of the same aspect, are brought to its size as our own models' a
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -26,22 +24,24 @@ from densify.dense_map import run_record
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
+from lightdepth.files.arrays import array_in, read_arrays
 from lightdepth.files.exr import read_exr
 from lightdepth.files.headers import what_is_there
-from lightdepth.files.images import read_raw
+from lightdepth.files.images import read_bytes, read_raw
 from lightdepth.geometry import distance_from_depth
 from lightdepth.prediction import DepthPrediction, read_prediction
+from lightdepth.ranges import above, checked
 
 DepthKind = Literal["distance", "depth", "disparity"]
 SUFFIXES = ("npz", "npy", "exr", "tiff", "tif", "png")
 """Endings that are read, the first that a folder has: a picture often lies beside the numbers."""
 _NAMES = ("distance", "depth", "disparity", "disp", "pred", "prediction", "arr_0")
 _CHANNELS = ("Z", *_NAMES[:4], "V", "Y", "R")
-_UNREADABLE = (OSError, EOFError, ValueError, TypeError, MemoryError, zipfile.BadZipFile, zlib.error)
 _LEAST_RAY_Z = 0.05  # as of true depth: farther to the side, depth along the axis says nothing
 
 
 @dataclass(frozen=True)
+@checked
 class DepthReading:
     """How a folder of depth is read. Without a kind it is one that `lightdepth predict` made."""
 
@@ -49,7 +49,7 @@ class DepthReading:
     """What the numbers of another program's depth files are (.npy, .npz, EXR, TIFF, 16-bit PNG): distance along the
     ray, depth along the axis, or disparity, which is one over depth. Left out, the folder is one of `lightdepth
     predict`."""
-    depth_scale: float | None = None
+    depth_scale: Annotated[float | None, above(0)] = None
     """Factor from the numbers in another program's depth files to mm (of disparity: depth is the factor over it). Left
     out, they are up to scale, or as `lightdepth export` says in its run.json. A larger one makes a farther wall."""
 
@@ -143,7 +143,7 @@ def other_depth(path: Path) -> bool:
 def _array(path: Path, kind: DepthKind) -> tuple[np.ndarray, np.ndarray]:
     """The numbers (H, W) of a file, and which of them it calls valid."""
     if path.suffix == ".npz":
-        arrays = _load_npz(path)
+        arrays = read_arrays(path)
         if kind != "distance" and arrays.keys() >= {"meta", "distance", "valid"}:  # as DepthPrediction is saved
             raise InputError(
                 path, "distance along the ray, as `lightdepth predict` writes it", "leave out --depth-kind"
@@ -166,18 +166,7 @@ def _array(path: Path, kind: DepthKind) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _load_npy(path: Path) -> np.ndarray:
-    try:
-        return np.asarray(np.load(path, allow_pickle=False))
-    except _UNREADABLE as error:
-        raise InputError(path, f"not an array ({error})", "expected numbers as numpy.save writes them") from error
-
-
-def _load_npz(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except _UNREADABLE as error:
-        raise InputError(path, f"not arrays ({error})", "expected an .npz as numpy.savez writes it") from error
+    return array_in(read_bytes(path), path)
 
 
 def _chosen(arrays: Mapping[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray | None]:

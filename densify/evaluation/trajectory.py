@@ -16,6 +16,7 @@ from densify.evaluation.errors import ate, rms, sideways_agreement
 from densify.evaluation.records import AlignedFigures, TrajectoryFigures
 from densify.similarity import Similarity, fit_similarity
 from lightdepth.errors import InputError
+from lightdepth.files.reading import reading
 from lightdepth.files.tum import read_tum
 from lightdepth.frame import frame_number
 from lightdepth.maps import read_trajectory
@@ -93,7 +94,11 @@ def read_trajectories(path: Path, reader: Reader = Reader()) -> list[Trajectory]
         raise InputError(
             path, "no trajectory", "expected a TUM file (t tx ty tz qx qy qz qw) or CLiMB's cam_traj_map_*.txt"
         )
-    return [_read(file, reader) for file in files]
+    found = []
+    for file in files:
+        with reading(file, "a trajectory"):
+            found.append(_read(file, reader))
+    return found
 
 
 def _read(file: Path, reader: Reader) -> Trajectory:

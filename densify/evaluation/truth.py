@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from densify.evaluation.trajectory import span
 from lightdepth.datasets import FrameSequence
 from lightdepth.datasets.checks import unusable_truth
 from lightdepth.errors import InputError
+from lightdepth.files.meshes import read_mesh
 from lightdepth.frame import Frame
 
 COVERAGE_MESH = "coverage_mesh.obj"
@@ -111,24 +111,6 @@ def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bo
                 "expected the surface that the sequence shows, in mm, in the frame of reference of its poses",
             )
     return Truth(*common, TrueSurface(cloud, sampling, surface, source))
-
-
-def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) and triangles (m, 3) of a PLY, OBJ, STL or GLB. Raises InputError when it is none."""
-    import trimesh
-
-    if not path.is_file():
-        raise InputError(path, "no such mesh", "correct its name, or put it there")
-    try:
-        mesh: Any = trimesh.load(path, process=False, force="mesh", skip_materials=True)
-        vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, int)
-    except Exception as error:  # whatever a broken file makes the reader stumble over
-        raise InputError(
-            path, f"not a mesh that can be read ({type(error).__name__}: {error})", "expected a PLY, OBJ, STL or GLB"
-        ) from error
-    if not len(triangles):
-        raise InputError(path, "no triangles in it", "expected a surface, not points alone")
-    return vertices, triangles
 
 
 def shared_frames(ours: Collection[int], theirs: Sequence[int], what: str, source: str, common: bool) -> list[int]:

@@ -23,7 +23,7 @@ from densify.exporting.exported import Exportable
 from densify.exporting.images import known_camera, pinhole_of, seen_by, write_image
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
-from lightdepth.errors import InputError
+from lightdepth.files.reading import reading
 from lightdepth.maps.colmap import write_text_model
 from lightdepth.sparse_map import Keyframe, Submap
 
@@ -40,11 +40,9 @@ def write_array(path: Path, values: np.ndarray) -> None:
 
 def read_array(path: Path) -> np.ndarray:
     """(H, W) or (H, W, C) float32 of a depth or normal map."""
-    try:
+    with reading(path, "a map of COLMAP's", "expected depth or normals in a .bin"):
         width, height, channels, data = path.read_bytes().split(b"&", 3)
         planes = np.frombuffer(data, "<f4").reshape(int(channels), int(height), int(width))
-    except (OSError, ValueError) as error:
-        raise InputError(path, f"not a map of COLMAP's ({error})", "expected depth or normals in a .bin") from error
     return planes[0] if len(planes) == 1 else planes.transpose(1, 2, 0)
 
 

@@ -16,6 +16,9 @@ from densify.dense_map import DenseMapFiles, Surface, map_folders, read_dense_ma
 from densify.inputs import fitted_to_frames
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
+from lightdepth.files.below import given
+from lightdepth.files.meshes import load_mesh
+from lightdepth.files.reading import reading
 from lightdepth.geometry import depth_from_distance
 from lightdepth.maps import read_map
 from lightdepth.maps.endocartoscope import TrajectoryPose, read_trajectory, trajectory_path
@@ -150,7 +153,8 @@ def _submaps(path: Path, folder: Path, record: Mapping[str, object]) -> dict[int
 
 def _localised(path: Path, map_id: int, scale: float) -> tuple[TrajectoryPose, ...]:
     """All localised frames of a map in the tree of EndoCartoScope or CLiMB, in the surface's unit; none elsewhere."""
-    files = sorted(path.rglob(trajectory_path(path, map_id).name)) if path.is_dir() else []
+    name = trajectory_path(path, map_id).name
+    files = given(sorted(path.rglob(name)), path) if path.is_dir() else []
 
     def moved(pose: TrajectoryPose) -> TrajectoryPose:
         cam_from_map = pose.cam_from_map.copy()
@@ -173,7 +177,8 @@ def _without_observations(folder: Path, dense: DenseMapFiles) -> Submap:
     """Keyframes as the run's files have them: names, camera, poses."""
     names = {int(n): f"{int(n):06d}" for n in dense.numbers}
     if (folder / "keyframes.csv").is_file():
-        with (folder / "keyframes.csv").open(encoding="utf-8", newline="") as file:
+        path = folder / "keyframes.csv"
+        with reading(path, "a table of keyframes"), path.open(encoding="utf-8", newline="") as file:
             names |= {int(row["frame"]): row["keyframe"] for row in csv.DictReader(file)}
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     keyframes = tuple(
@@ -185,9 +190,10 @@ def _without_observations(folder: Path, dense: DenseMapFiles) -> Submap:
 
 def _looks(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Colours (n, 3) uint8 and unit normals (n, 3) of a mesh file's vertices."""
-    import trimesh
-
-    mesh: Any = trimesh.load(path, process=False)
-    colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(np.uint8)
-    assert len(colors) == count, (len(colors), count)
-    return colors, np.asarray(mesh.vertex_normals, float)
+    mesh: Any = load_mesh(path)
+    with reading(path, "a mesh with colours"):
+        colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(np.uint8)
+        normals = np.asarray(mesh.vertex_normals, float)
+    if len(colors) != count:
+        raise InputError(path, f"{len(colors)} colours of {count} vertices", "expected one each")
+    return colors, normals

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from densify.dense_map import map_folders, run_record
 from densify.exporting.colmap import write_colmap
@@ -16,12 +16,14 @@ from densify.exporting.trees import write_climb, write_trajectory
 from lightdepth.calibration import read_camera
 from lightdepth.datasets import FORMATS, FrameSequence, open_sequence
 from lightdepth.errors import InputError
+from lightdepth.ranges import ANY, at_least, checked
 from lightdepth.reporting.run import Run
 
 MAP_KINDS = Literal["colmap", "nerfstudio", "ply", "glb", "obj", "tum", "climb"]
 
 
 @dataclass(frozen=True)
+@checked
 class MapExport:
     """What goes with the maps of a densify run."""
 
@@ -29,10 +31,10 @@ class MapExport:
     """Frames of the run, for pictures, masks and times; left out, those that the run names, where they still are."""
     map: Path | None = None
     """Sparse map that the run was made of, for tracks; left out, the one that the run names, where it still is."""
-    points: int = 100_000
+    points: Annotated[int, at_least(0)] = 100_000
     """Number of the surface's vertices at most that stand among the points of colmap, nerfstudio and climb, besides
     the map's own. More show the surface more finely and make larger files."""
-    frame_offset: int = 1
+    frame_offset: Annotated[int, ANY] = 1
     """Number added to each frame's number where climb is written, which counts frames from 1 and we from 0. A larger
     one gives later numbers."""
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -22,34 +22,36 @@ from densify.fusion.second_core import halves
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
+from lightdepth.ranges import SHARE, above, checked
 
 FULL = 255
 """The weight of a pixel that nothing speaks against. Weights are whole numbers, so that sums of them are exact."""
 
 
 @dataclass(frozen=True)
+@checked
 class RectifyConfig:
     """Which predicted pixels are handed to the fusion, how finely, and with what weight."""
 
-    focal_px: float = 256.0
+    focal_px: Annotated[float, above(0, up_to=100_000)] = 256.0
     """Finest resolution that is fused, pixels per radian of view; blocks of pixels of finer images are averaged first.
     A larger one keeps more detail and takes longer."""
     field: Literal["whole", "pinhole"] = "whole"
     """Which pixels are fused: whole, all that the lens shows; pinhole, only what an undistorted image of the same size
     and focal length would hold, which crops the border of a wide lens."""
-    max_slope: float = 10.0
+    max_slope: Annotated[float, above(0)] = 10.0
     """Largest change of log distance per radian of view with which a pixel is fused: 10 leaves out edges, and wall seen
     at less than 5.7 degrees to its surface. A larger one keeps more of the wall, less accurately."""
-    dark: float = 0.02
+    dark: Annotated[float, SHARE] = 0.02
     """Brightness of a pixel's brightest channel, in [0, 1], below which its weight falls from 1, to unlit at black. A
     higher one trusts dark pixels less."""
-    bright: float = 0.98
+    bright: Annotated[float, SHARE] = 0.98
     """Brightness of a pixel's brightest channel, in [0, 1], above which its weight falls from 1, to unlit at full
     brightness, because it may be clipped. A higher one trusts bright pixels more."""
-    unlit: float = 0.5
+    unlit: Annotated[float, SHARE] = 0.5
     """Weight, from 0 to 1, of a black or clipped pixel, a well-lit one having 1. A larger one trusts such pixels more;
     below 0.5 surfaces came out a little worse."""
-    sigma: float = 0.15
+    sigma: Annotated[float, above(0)] = 0.15
     """Uncertainty that the model states for a pixel, as standard deviation of log distance (0.15 is 15 %), at which the
     pixel's weight is halved. A larger one trusts uncertain pixels more; models that state none are not affected."""
 

@@ -12,6 +12,7 @@ views does not matter, and a surface put together again after a loop closure is,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from densify.fusion.marching_cubes import BLOCK, CORNERS, REACH, Cut, cut, one_v
 from densify.fusion.rectify import FULL, SurfaceView
 from densify.fusion.second_core import halves
 from lightdepth.errors import InputError
+from lightdepth.ranges import COUNT, above, checked
 from lightdepth.sparse_map import Submap, typical_distance
 
 STEPS = 2048
@@ -29,22 +31,23 @@ _SPARSE = 4  # every so many pixels are enough to find the blocks
 
 
 @dataclass(frozen=True)
+@checked
 class FusionConfig:
     """Resolution and reach of the surface."""
 
-    voxel: float | None = None
+    voxel: Annotated[float | None, above(0)] = None
     """Edge of a voxel, the smallest cell of the volume that the surface is made in, map units; left out,
     voxels_per_distance sets it. A larger one makes a coarser surface, sooner."""
-    voxels_per_distance: float = 52.0
+    voxels_per_distance: Annotated[float, above(0, up_to=1000)] = 52.0
     """Number of voxels in the typical distance from a submap's keyframes to their points, which sets the voxels' size
     where voxel is left out. More make a finer surface and take more time and memory."""
-    truncation: float = 6.0
+    truncation: Annotated[float, above(0, up_to=1000)] = 6.0
     """Distance before and behind the surface, voxels, over which what the keyframes say is averaged (a TSDF's
     truncation). A larger one smooths more noise away, and more thin folds with it."""
-    min_views: int = 1
+    min_views: Annotated[int, COUNT] = 1
     """Least number of keyframes that must have seen a piece of surface for it to be kept; the recipe paper keeps all.
     More leave out what few have seen."""
-    far: float = 2.0
+    far: Annotated[float, above(0)] = 2.0
     """Farthest distance from a keyframe that is fused, as a multiple of the distance within which 90 % of its inliers
     lie. A larger one reaches farther, where depth is worse."""
 

@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from lightdepth.calibration.mat_file import OBJECT, mat_variables
 from lightdepth.camera import CameraModel, camera_from_params, camera_of, opencv_camera
 from lightdepth.errors import InputError
+from lightdepth.files.reading import MOST_TEXT, check_bytes, reading
 
 _AS_STRUCTURE = "in MATLAB: s = toStruct(params); save('camera.mat', '-struct', 's', '-v7')"
 _EXPECTED = (
@@ -39,19 +41,15 @@ def read_matlab(path: Path) -> CameraModel:
 
 
 def _variables(path: Path) -> Variables:
-    from scipy.io import loadmat
-
-    try:
-        variables: dict[str, Any] = loadmat(path, squeeze_me=True, struct_as_record=False)
-    except NotImplementedError as error:
-        raise InputError(
-            path, "a MATLAB file of version 7.3 (HDF5)", f"save it as version 7: {_AS_STRUCTURE}"
-        ) from error
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror or error})", "expected a MATLAB file") from error
-    except Exception as error:  # whatever a broken file makes the reader stumble over
-        raise InputError(path, f"not a MATLAB file that can be read ({error})", "save it again") from error
-    if any(type(value).__name__ == "MatlabOpaque" for value in variables.values()) or "None" in variables:
+    with reading(path, "a MATLAB file that can be read", "save it again"):
+        check_bytes(path.stat().st_size, MOST_TEXT, path, "calibration")
+        try:
+            variables = mat_variables(path)
+        except NotImplementedError as error:
+            raise InputError(
+                path, "a MATLAB file of version 7.3 (HDF5)", f"save it as version 7: {_AS_STRUCTURE}"
+            ) from error
+    if any(value is OBJECT for value in variables.values()):
         raise InputError(path, "a MATLAB object, which only MATLAB can read", f"save a structure: {_AS_STRUCTURE}")
     return variables
 
@@ -60,7 +58,7 @@ def _structures(variables: Variables) -> list[Variables]:
     """The variables themselves, and the fields of each structure among them, two deep."""
     found, level = [variables], list(variables.values())
     for _ in range(2):
-        below = [vars(v) for v in level if hasattr(v, "_fieldnames")]
+        below = [v for v in level if isinstance(v, dict)]
         found += below
         level = [v for fields in below for v in fields.values()]
     return found

@@ -10,21 +10,23 @@ from typing import Any
 
 import yaml
 
+from lightdepth import plain_yaml
 from lightdepth.calibration.matrix import matrix_and_distortion, matrix_numbers
 from lightdepth.calibration.other_programs import other_program
 from lightdepth.calibration.plain_text import cannot_hold
 from lightdepth.calibration.xml_text import opencv_fields
 from lightdepth.camera import Brown, CameraModel, FullBrown, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
+from lightdepth.files.reading import reading
 from lightdepth.files.text import read_text
 from lightdepth.files.writing import write_whole
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(plain_yaml.Loader):
     """A safe loader that takes OpenCV's matrices for the mappings they are."""
 
 
-def _mapping(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+def _mapping(loader: plain_yaml.Loader, node: yaml.MappingNode) -> dict[Any, Any]:
     return loader.construct_mapping(node, deep=True)
 
 
@@ -35,7 +37,8 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):  # the second is OpenCV 5's f
 def read_opencv(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
     """The camera of a YAML, or of OpenCV's XML. Keys in any case; what is not about the camera is passed over. `size`
     (width, height) is that of the images, for files that hold none."""
-    return camera_of_keys(_fields(path), path, size)
+    with reading(path, "a calibration in YAML or XML"):
+        return camera_of_keys(_fields(path), path, size)
 
 
 def camera_of_keys(fields: dict[str, Any], path: Path, size: tuple[int, int] | None = None) -> CameraModel:
@@ -46,6 +49,11 @@ def camera_of_keys(fields: dict[str, Any], path: Path, size: tuple[int, int] | N
 
 def read_matrices(path: Path, names: tuple[str, ...]) -> dict[str, list[float]]:
     """The numbers of named matrices in an OpenCV YAML, row by row: a stereo calibration's M1, D1, T."""
+    with reading(path, "a calibration in YAML or XML"):
+        return _matrices(path, names)
+
+
+def _matrices(path: Path, names: tuple[str, ...]) -> dict[str, list[float]]:
     fields = _fields(path)
     missing = [name for name in names if fields.get(name.lower()) is None]
     if missing:
@@ -64,8 +72,8 @@ def _fields(path: Path) -> dict[str, Any]:
     # OpenCV's first line, `%YAML:1.0`, is no YAML.
     text = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
     try:
-        data = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        data = plain_yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
         raise InputError(path, f"not valid YAML ({' '.join(str(error).split())[:200]})", "correct it there") from error
     if not isinstance(data, dict):
         raise InputError(path, "no keys in it", "expected camera_matrix, distortion_coefficients and the image size")

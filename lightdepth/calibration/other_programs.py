@@ -171,7 +171,7 @@ def needed_size(size: Size, where: str, what: str) -> tuple[int, int]:
         raise InputError(
             where,
             f"holds no image size ({what} missing)",
-            "add them (read_camera(path, size=(width, height)), or --size where a verb has it)",
+            "add them, or convert it: `lightdepth convert-camera FILE --size '[WIDTH, HEIGHT]' -o camera.json`",
         )
     return size
 

@@ -86,7 +86,7 @@ def read_intrinsics(path: Path, size: tuple[int, int] | None) -> Pinhole:
         raise InputError(
             path,
             "holds no image size",
-            'give it (read_camera(path, size=(width, height))), or write a camera.json: {"model": "PINHOLE", '
+            'give it (`lightdepth convert-camera FILE --size`), or write a camera.json: {"model": "PINHOLE", '
             f'"width": W, "height": H, "params": [{fx:g}, {fy:g}, {cx:g}, {cy:g}], "pixel_center": 0.0}}',
         )
     camera = camera_from_params("PINHOLE", *size, [fx, fy, cx, cy], str(path)).with_pixel_center(0.0)

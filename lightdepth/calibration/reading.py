@@ -28,6 +28,7 @@ from lightdepth.calibration.vicalib import read_photometric, read_vicalib, write
 from lightdepth.camera import CameraModel, Scaramuzza
 from lightdepth.errors import InputError
 from lightdepth.files.colmap_cameras import read_cameras_binary
+from lightdepth.files.reading import MOST_TEXT, check_bytes, reading
 from lightdepth.files.schema import read_json
 from lightdepth.files.text import read_text, rows
 from lightdepth.photometry import PhotometricCalibration
@@ -58,7 +59,9 @@ def read_camera(path: Path, size: tuple[int, int] | None = None) -> CameraModel:
     is exactly becomes the nearest, which a warning says in pixels. Raises InputError, naming file and field, for what
     cannot be read.
     """
-    return _in_pixels(_read(Path(path), size), path)
+    with reading(path, "a camera calibration"):
+        check_bytes(Path(path).stat().st_size if Path(path).is_file() else 0, MOST_TEXT, path, "calibration")
+        return _in_pixels(_read(Path(path), size), path)
 
 
 def _read(path: Path, size: tuple[int, int] | None) -> CameraModel:
@@ -150,6 +153,11 @@ def write_camera(camera: CameraModel, path: Path, format: str | None = None) -> 
 
 def read_light(source: str | Path) -> PhotometricCalibration:
     """A light.json file, an EndoMapper photometric XML, or values written out as `gamma=2.2,mu=0`."""
+    with reading(source, "a calibration of the light"):
+        return _light_at(source)
+
+
+def _light_at(source: str | Path) -> PhotometricCalibration:
     text, path = str(source), Path(source)
     if "=" in text and not path.exists():
         return light_from_text(text)

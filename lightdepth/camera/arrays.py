@@ -17,6 +17,7 @@ Array = TypeVar("Array", np.ndarray, Tensor)
 
 NEAR_AXIS = 1e-6  # radians; the lenses are linear there to 1e-12 of the distance from the axis
 _FLATTEST = 1e-5  # z over the distance from the axis, at which x/z ends: the powers of more overflow float32
+_NO_COEFFICIENT = 1e-100
 
 
 def namespace(array: np.ndarray | Tensor) -> Any:
@@ -103,6 +104,7 @@ def at_radius(points: Array, side: Array, rho: Array, focal: float) -> Array:
 @lru_cache(maxsize=256)
 def first_positive_root(*coefficients: float) -> float:
     """Smallest positive real root of a polynomial (highest power first); infinity when there is none."""
-    roots = np.roots(coefficients)
+    # Of a coefficient without size the root lies beyond any image, and the others divided by it overflow.
+    roots = np.roots([0.0 if abs(c) < _NO_COEFFICIENT else c for c in coefficients])
     real = roots[np.abs(roots.imag) < 1e-9 * np.maximum(1, np.abs(roots.real))].real
     return float(min(real[real > 0], default=np.inf))

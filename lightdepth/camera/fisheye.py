@@ -20,7 +20,7 @@ from lightdepth.camera.arrays import (
     namespace,
     unit,
 )
-from lightdepth.camera.model import MAX_THETA, TABLE, CameraModel, FocalCamera
+from lightdepth.camera.model import LEAST_FOCAL, MAX_THETA, TABLE, CameraModel, FocalCamera
 from lightdepth.errors import InputError
 
 
@@ -92,7 +92,7 @@ class Scaramuzza(CameraModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.a0 <= 0:
+        if not self.a0 >= LEAST_FOCAL:
             raise InputError("SCARAMUZZA camera", f"a0 = {self.a0}", "expected positive pixels (z into the scene)")
         if abs(self.c - self.d * self.e) < 1e-9:
             raise InputError(

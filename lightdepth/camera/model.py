@@ -13,6 +13,12 @@ from lightdepth.camera.arrays import Array, floating, scaled
 from lightdepth.errors import InputError
 
 MAX_THETA = np.pi / 2
+LONGEST_SIDE = 65535
+"""Pixels of the longest side of an image."""
+LARGEST = 1e12
+"""Magnitude of a parameter beyond which a camera is of a broken file: its products leave double precision."""
+LEAST_FOCAL = 1e-6
+"""Pixels of a focal length below which it is none: its inverse is a factor of every ray."""
 TABLE = 2048  # entries of the tables from which Newton's method starts
 
 
@@ -27,10 +33,17 @@ class CameraModel(ABC):
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
-            raise InputError("camera size", f"{self.width}x{self.height}", "expected positive numbers of pixels")
+            size = f"{str(self.width)[:20]}x{str(self.height)[:20]}"
+            raise InputError("camera size", size, "expected positive numbers of pixels")
+        if max(self.width, self.height) > LONGEST_SIDE:
+            digits = f"{str(self.width)[:20]}x{str(self.height)[:20]}"
+            raise InputError("camera size", digits, f"expected sides of at most {LONGEST_SIDE} pixels")
         bad = [f.name for f in fields(self) if not np.isfinite(getattr(self, f.name))]
         if bad:
             raise InputError(f"{self.name} camera", f"{', '.join(bad)} not finite", "expected numbers")
+        large = [f.name for f in fields(self) if abs(getattr(self, f.name)) > LARGEST]
+        if large:
+            raise InputError(f"{self.name} camera", f"{', '.join(large)} beyond {LARGEST:g}", "expected pixels")
 
     @abstractmethod
     def _pixels(self, points: Array) -> tuple[Array, Array]:
@@ -102,7 +115,7 @@ class FocalCamera(CameraModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.fx <= 0 or self.fy <= 0:
+        if not (self.fx >= LEAST_FOCAL and self.fy >= LEAST_FOCAL):
             raise InputError(f"{self.name} camera", f"focal lengths {self.fx}, {self.fy}", "expected positive pixels")
 
     @property

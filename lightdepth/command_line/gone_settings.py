@@ -1,4 +1,5 @@
-"""Settings of earlier versions that are no more: a config file that has them is still read, with one warning.
+"""Settings that a config file has and that are not taken from it: those of earlier versions that are no more, and those
+that are given with each run, as where it goes. The file is still read, with a warning.
 
 A key that was never a setting stays an error: it is a typing mistake.
 """
@@ -12,6 +13,7 @@ from typing import Any
 
 _WITHHOLD = "the surface uses every point; blocks of wall judge it, see judge.folds"
 _NO_EFFECT = "it had no effect"
+_NO_CODE = "settings name no code: fit() of train.fit takes such objects"
 _ALWAYS = "a run always has its log and checkpoints"
 GONE_SETTINGS: dict[str, dict[str, str]] = {
     "import": {"source": "it is data now, as with the other verbs"},
@@ -21,24 +23,35 @@ GONE_SETTINGS: dict[str, dict[str, str]] = {
         **dict.fromkeys(("trainer.limit_test_batches", "trainer.limit_predict_batches"), _NO_EFFECT),
         **dict.fromkeys(("trainer.enable_autolog_hparams", "trainer.model_registry"), _NO_EFFECT),
         **dict.fromkeys(("trainer.enable_checkpointing", "trainer.barebones"), _ALWAYS),
+        **dict.fromkeys(("trainer.callbacks", "trainer.plugins"), _NO_CODE),
     },
 }
 """By verb, the dotted keys that are gone, each with what became of it. A key stands for all that is below it."""
+GIVEN_WITH_EACH_RUN = ("output", "overwrite", "resume", "table", "config", "preset")
+"""Options that no file sets: a file of someone else's does not say what is written where, and what is replaced there.
+So the config.yaml of a run serves for another one."""
 
 
 def without_gone(verb: str, argv: Sequence[str]) -> list[str]:
-    """The words of a command line; a --config FILE that has settings which are gone is put in as text without them."""
+    """The words of a command line; a --config FILE with settings that are not taken from it is put in as text without
+    them."""
     gone = GONE_SETTINGS.get(verb, {})
     words = list(argv)
     for place, word in enumerate(words):
         joined = word.startswith("--config=")
-        if gone and (joined or (place > 0 and words[place - 1] == "--config")):
+        if joined or (place > 0 and words[place - 1] == "--config"):
             words[place] = ("--config=" if joined else "") + _kept(word.removeprefix("--config="), gone)
     return words
 
 
+def without_given(settings: dict[str, Any]) -> list[str]:
+    """Takes what is given with each run out of settings, and names what said something."""
+    taken = {key: settings.pop(key) for key in GIVEN_WITH_EACH_RUN if key in settings}
+    return [key for key, value in taken.items() if value not in (None, False)]
+
+
 def _kept(file: str, gone: Mapping[str, str]) -> str:
-    """The file's name, or, where it has settings that are gone, its text without them."""
+    """The file's name, or, where it has settings that are not taken from it, its text without them."""
     import yaml
 
     from lightdepth.command_line.settings_yaml import read_settings
@@ -47,12 +60,18 @@ def _kept(file: str, gone: Mapping[str, str]) -> str:
         settings = read_settings(Path(file))
     except (OSError, ValueError, yaml.YAMLError):
         return file  # the parser says what is wrong with it
-    found = {key: why for key, why in gone.items() if _dropped(settings, key.split("."))}
-    if not found:
+    if not isinstance(settings, dict):
         return file
-    listed = "; ".join(f"{key} ({why})" for key, why in found.items())
-    warnings.warn(f"{file}: settings that are no more are left out: {listed}", UserWarning, stacklevel=2)
-    return yaml.safe_dump(settings, sort_keys=False)
+    count = len(settings)
+    given = without_given(settings)
+    found = {key: why for key, why in gone.items() if _dropped(settings, key.split("."))}
+    if given:
+        said = f"{file}: left out, as they are given with each run: {', '.join(given)}"
+        warnings.warn(said, UserWarning, stacklevel=2)
+    if found:
+        listed = "; ".join(f"{key} ({why})" for key, why in found.items())
+        warnings.warn(f"{file}: settings that are no more are left out: {listed}", UserWarning, stacklevel=2)
+    return yaml.safe_dump(settings, sort_keys=False) if found or len(settings) < count else file
 
 
 def _dropped(settings: Any, keys: Sequence[str]) -> bool:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -68,3 +69,10 @@ def _in_words(kind: Any) -> str:
     if get_origin(kind) is dict or kind is dict:
         return "a mapping of names to values"
     return typing.cast(str, getattr(kind, "__name__", str(kind)))
+
+
+def list_apart(argv: Sequence[str], first: str) -> str:
+    """A list of which each number was typed as a word of its own, from its first on, as one word; "" where none was."""
+    at = argv.index(first) if first in argv else len(argv)
+    together = list(itertools.takewhile(lambda word: word.replace(".", "", 1).isdecimal(), argv[at:]))
+    return f"[{','.join(together)}]" if len(together) > 1 else ""

@@ -19,17 +19,16 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
 import yaml
-from jsonargparse import (
-    ArgumentParser,
-    DefaultHelpFormatter,
-    Namespace,
-    set_parsing_settings,
-)
+from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
 
+from lightdepth import plain_yaml
 from lightdepth.command_line.gone_settings import GONE_SETTINGS
-from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, literals, placeholder
+from lightdepth.command_line.kinds import METAVARS, choices_of_type, expected, leaves, list_apart, literals, placeholder
 from lightdepth.command_line.pages import Page
-from lightdepth.command_line.settings_yaml import read_settings, use_words
+from lightdepth.command_line.ranges import check_ranges, range_in, set_ranges, taken
+from lightdepth.command_line.settings_yaml import read_settings, take_plain_values, use_words
+from lightdepth.ranges import Range
+from lightdepth.regular import regular
 
 HELP, HELP_ALL = ("-h", "--help"), ("--help-all", "--help_all")
 _WIDTH = 100
@@ -54,8 +53,9 @@ class Formatter(DefaultHelpFormatter):
     def _get_help_string(self, action: argparse.Action) -> str:
         """The sentence, and in brackets what kind of value is taken, where its placeholder does not show it."""
         kind, notes = getattr(action, "_typehint", None), ["required"] if action.required else []
-        if any(one in (int, float) for one in choices_of_type(kind)) or not METAVARS.keys() >= leaves(kind):
-            notes.append(expected(kind))
+        within = range_in(action)
+        if any(one in (int, float) for one in choices_of_type(kind)) or not METAVARS.keys() >= leaves(kind) or within:
+            notes.append(taken(kind, within))
         if action.default not in (None, argparse.SUPPRESS, ()) and action.nargs != 0:
             shown = (
                 action.default if isinstance(action.default, (str, Path)) else json.dumps(action.default, default=str)
@@ -76,6 +76,7 @@ class Parser(ArgumentParser):
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         set_parsing_settings(docstring_parse_attribute_docstrings=True)
         use_words()
+        take_plain_values()
         super().__init__(*arguments, **{"formatter_class": Formatter, **settings})
         self.page = Page()
 
@@ -145,9 +146,10 @@ def _is_head(action: argparse.Action) -> bool:
     return type(action).__name__ == "_ActionConfigLoad"
 
 
-def finish(parser: Parser, page: Page) -> None:
-    """Gives a parser that has all its options its page, and what the library says of its own options in our words."""
+def finish(parser: Parser, page: Page, ranges: Mapping[str, Range]) -> None:
+    """Gives a parser that has all its options its page and their ranges, and the library's own options our words."""
     parser.page = page
+    set_ranges(parser._actions, ranges)
     plain = [a for a in options(parser) if "." not in a.dest]
     order = sorted(plain, key=lambda a: (bool(a.option_strings), a.dest != "output", a.dest in _LAST))
     for group in parser._action_groups:
@@ -171,12 +173,20 @@ def parsed(parser: Parser, argv: Sequence[str]) -> Namespace:
             print(parser.help_page(word in HELP_ALL), end="")
             raise SystemExit(0)
     parser.exit_on_error = False
-    for file in _config_files(argv):
+    for file in config_files(argv):
         _check_config(parser, file)
     try:
-        return parser.parse_args(spelled(parser, argv))
-    except argparse.ArgumentError as error:
+        found = parser.parse_args(spelled(parser, argv))
+    except (argparse.ArgumentError, ImportError) as error:
         fail(parser, one_line(parser, argv, str(error)))
+    check_ranges(options(parser), found.get, lambda action: _where(argv, action))
+    return found
+
+
+def _where(argv: Sequence[str], action: argparse.Action) -> str:
+    """An option as it was given: on the command line, or in a file of settings."""
+    name = f"--{dashed(action.dest)}" if action.option_strings else action.dest
+    return name if _on_line(argv, action.dest) else f"{_file_with(argv, action.dest)}{name}"
 
 
 def fail(parser: Parser, message: str) -> NoReturn:
@@ -242,7 +252,7 @@ def listed(action: argparse.Action) -> tuple[Any, bool] | None:
 
 def _list_text(value: str, of: Any, nested: bool) -> str:
     try:
-        read = yaml.safe_load(value)
+        read = plain_yaml.load(value)
     except yaml.YAMLError:
         read = value
     if isinstance(read, Mapping) or read is None:
@@ -264,7 +274,9 @@ def _as_list(value: Any, of: Any, nested: bool) -> Any:
 def one_line(parser: Parser, argv: Sequence[str], message: str) -> str:
     """What is wrong with the words of a command line: what was typed, the nearest that there is, where to read on."""
     name = ""
-    if found := re.search(r"unrecognized arguments: (\S+)", message):
+    if found := re.search(r"Importing '(.+?)' is not allowed", message):
+        said = f"{found[1]}: settings take plain values, and name no code"
+    elif found := re.search(r"unrecognized arguments: (\S+)", message):
         said, name = _unknown(parser, found[1])
     elif found := re.search(r"Option '(.+?)' is not accepted|Group '(.+?)' does not accept option '(.+?)'", message):
         key = found[1] or f"{found[2]}.{found[3]}"
@@ -276,13 +288,13 @@ def one_line(parser: Parser, argv: Sequence[str], message: str) -> str:
     elif found := re.search(r"argument (\S+?): expected one argument", message):
         said = f"{dashed(found[1].split('/')[0])} needs a value"
     elif found := re.search(r"Problems parsing config: (.*)", message, re.DOTALL):
-        files = [path for path in _config_files(argv) if not _is_yaml(path)]
+        files = [path for path in config_files(argv) if _not_yaml(path)]
         said = f"{files[0] if files else '--config'}: not YAML: {' '.join(found[1].split())}"
     else:
         said = " ".join(message.split())
     everyday = not name or parser.page.shows(name.lstrip("-").replace("-", "_"))
-    stop = "" if said.endswith("?") else "."
-    return f"{said}{stop} Read on: {parser.prog} {'--help' if everyday and '.' not in name else '--help-all'}"
+    page = "--help" if everyday and "." not in name else "--help-all"
+    return f"{said}{'.' * (not said.endswith('?'))} Read on: {parser.prog} {page}"
 
 
 def _unknown(parser: Parser, word: str) -> tuple[str, str]:
@@ -297,9 +309,8 @@ def _unknown(parser: Parser, word: str) -> tuple[str, str]:
 
 
 def _names(parser: Parser) -> list[str]:
-    return [o[2:] for a in options(parser) for o in a.option_strings if o.startswith("--")] + [
-        a.dest for a in options(parser) if not a.option_strings
-    ]
+    long = [o[2:] for a in options(parser) for o in a.option_strings if o.startswith("--")]
+    return long + [a.dest for a in options(parser) if not a.option_strings]
 
 
 def closest(word: str, known: Sequence[str]) -> str:
@@ -335,6 +346,8 @@ def _wrong_value(parser: Parser, argv: Sequence[str], key: str, message: str) ->
         return f"{where}{named} {' '.join(message.split())}"
     choices = [c for one in choices_of_type(kind) for c in literals(one)]
     hint = _nearest(value, [str(c) for c in choices]) if choices else ""
+    if action is not None and (apart := list_apart(argv, value)) and get_origin(next(choices_of_type(kind))) is tuple:
+        hint = f"; give them as one word: {apart}"
     return f"{where}{named} {value}: expected {expected(kind)}{hint}"
 
 
@@ -342,18 +355,21 @@ def _on_line(argv: Sequence[str], key: str) -> bool:
     return any(_underscored(word).partition("=")[0].startswith(f"--{key}") for word in argv)
 
 
-def _config_files(argv: Sequence[str]) -> Iterator[Path]:
+def config_files(argv: Sequence[str]) -> Iterator[Path]:
+    """The files that --config names among the words of a command line."""
     for word, following in pairwise([*argv, ""]):
         path = following if word == "--config" else word.removeprefix("--config=") if word[:9] == "--config=" else ""
         if path and "\n" not in path and Path(path).is_file():  # settings may stand there themselves (gone_settings)
             yield Path(path)
+        elif path and "\n" not in path:
+            regular(path, "expected a YAML file of settings")
 
 
 def _check_config(parser: Parser, file: Path) -> None:
     """Ends the program where a file is no YAML of settings, or has a value in the place of a group of them."""
     more = f"Read on: {parser.prog} --help"
-    if not _is_yaml(file):
-        fail(parser, f"{file}: not YAML: expected a line `option: value` for each setting, in UTF-8. {more}")
+    if why := _not_yaml(file):
+        fail(parser, f"{file}: not YAML: {why}; expected a line `option: value` for each setting, in UTF-8. {more}")
     found = read_settings(file)
     if not isinstance(found, Mapping):
         fail(parser, f"{file}: no settings in it; expected a line `option: value` for each. {more}")
@@ -363,19 +379,20 @@ def _check_config(parser: Parser, file: Path) -> None:
             fail(parser, f"{file}: {key} is {value!r}; expected settings below it, such as {below[key]}. {more}")
 
 
-def _is_yaml(path: Path) -> bool:
+def _not_yaml(path: Path) -> str:
+    """Why a file is no YAML of settings; nothing where it is."""
     try:
         read_settings(path)
-    except (yaml.YAMLError, UnicodeDecodeError):
-        return False
-    return True
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        return " ".join(str(error).split())[:200] or "no text"
+    return ""
 
 
 def _file_with(argv: Sequence[str], key: str) -> str:
     """`FILE: ` for the last file of settings on the command line that has the key, else nothing."""
     result = ""
-    for path in _config_files(argv):
-        node: Any = read_settings(path) if _is_yaml(path) else None
+    for path in config_files(argv):
+        node: Any = None if _not_yaml(path) else read_settings(path)
         for part in key.split("."):
             node = node.get(part, _ABSENT) if isinstance(node, Mapping) else _ABSENT
         result = f"{path}: " if node is not _ABSENT else result

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from jsonargparse import get_loader, set_loader
+from jsonargparse import get_loader, set_loader, set_parsing_settings
+
+from lightdepth import plain_yaml
 
 _WORDS = {True: "on", False: "off"}
 _DASHED = re.compile(r"[a-z][a-z0-9_.]*(-[a-z0-9_.]+)+")
@@ -18,7 +20,7 @@ _library = get_loader("yaml")
 
 def read_settings(file: Path) -> Any:
     """What a file of settings holds. Raises OSError, UnicodeDecodeError or yaml.YAMLError."""
-    return with_words(yaml.safe_load(file.read_text(encoding="utf-8-sig")))
+    return with_words(plain_yaml.read(file))
 
 
 def use_words() -> None:
@@ -26,11 +28,26 @@ def use_words() -> None:
     set_loader("yaml", _loaded, exceptions=(yaml.YAMLError,))
 
 
+def take_plain_values() -> None:
+    """Keeps a file of settings from naming a module to import, a class to make, or an address to read."""
+    set_parsing_settings(
+        import_path_denylist=["*"],
+        import_path_allowlist=["lightdepth", "densify", "train"],  # where the classes of our own options are
+        instantiate_subclass_spec_in_any=False,
+        config_read_mode_urls_enabled=False,
+        config_read_mode_fsspec_enabled=False,
+    )
+
+
 def _loaded(text: str) -> Any:
     """What a word of the command line, or a file, means as YAML; the name of a file that is not UTF-8 means itself."""
     if any("\udc80" <= letter <= "\udcff" for letter in text):
         return text
-    return with_words(_library(text))
+    plain_yaml.check(text)
+    try:
+        return with_words(_library(text))
+    except (ValueError, OverflowError) as error:  # a number of 5000 digits
+        raise yaml.YAMLError(str(error)) from error
 
 
 def with_words(value: Any) -> Any:

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from lightdepth import camera_conversion
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.datasets.sequence import read_mask
 from lightdepth.errors import InputError
+from lightdepth.files.replacing import check_files
+from lightdepth.ranges import PIXELS, at_least
 
 
 def convert_camera(
     file: Path,
     output: Path,
     model: Literal["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "SCARAMUZZA"] | None = None,
-    size: tuple[int, int] | None = None,
+    size: Annotated[tuple[int, int] | None, PIXELS] = None,
     to: Literal["json", "vicalib", "opencv", "colmap", "ocamcalib", "intrinsics", "intrinsics4x4"] | None = None,
     mask: Path | None = None,
-    most_px: float | None = None,
+    most_px: Annotated[float | None, at_least(0)] = None,
     overwrite: bool = False,
 ) -> None:
     """A calibration file in another format, or as another lens model, and by how many pixels that differs.
@@ -39,8 +41,9 @@ def convert_camera(
             Left out, half a percent of the image's longer side. A larger one lets a worse fit through.
         overwrite: Replace a file made before.
     """
-    if output.exists() and not overwrite:
-        raise InputError(output, "already there", "choose another -o, or give --overwrite")
+    check_files([output], overwrite, [file, mask])
+    if most_px is not None and model is None:
+        raise InputError("--most-px", "given without --model", "leave it out: it is of the fit of another lens model")
     if size is not None and min(size) < 1:
         raise InputError("--size", f"{list(size)}", "expected a width and a height of some pixels")
     if most_px is not None and not most_px > 0:
@@ -67,6 +70,5 @@ def convert_camera(
             f"(largest), over the {100 * found.seen_share:.1f} % of the field that it can represent"
         )
         camera = found.camera
-    output.parent.mkdir(parents=True, exist_ok=True)
     write_camera(camera, output, to)
     print(f"{said}\n{output}")

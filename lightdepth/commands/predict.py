@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.hidden_uncertainty import read_factor
+from lightdepth.ranges import at_least
 from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.progress import Progress
@@ -24,7 +26,7 @@ def predict(
     source: Group[SequenceSource],
     output: Path,
     checkpoint: str = DEFAULT_CHECKPOINT,
-    refine: int = 0,
+    refine: Annotated[int, at_least(0, up_to=100_000)] = 0,
     uncertainty: Path | None = None,
     previews: bool = True,
     overwrite: bool = False,

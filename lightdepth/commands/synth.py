@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from lightdepth.calibration import read_light
 from lightdepth.command_line.options import Group
 from lightdepth.errors import InputError
+from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least, checked
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import Lens, render_sequence
@@ -23,20 +24,21 @@ from lightdepth.tube.slam import SlamConfig, simulate_slam
 
 
 @dataclass(frozen=True)
+@checked
 class ColonConfig:
     """A synthetic colon, the endoscope in it, and the way that it takes."""
 
     lens: Lens = "c3vd"
     """Lens of the endoscope: pinhole (90 degrees across), telescope (70), fisheye (136) or c3vd (that of the data set
     C3VD)."""
-    frames: int = 120
+    frames: Annotated[int, COUNT] = 120
     """Number of frames to render, spread evenly over --travel-mm. More lie closer together on the same path, and take
     longer."""
-    size: tuple[int, int] = (320, 256)
+    size: Annotated[tuple[int, int], at_least(8, up_to=10_000)] = (320, 256)
     """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Number that draws the colon, its light, the path and the SLAM's errors. Another one draws others."""
-    travel_mm: float = 36.0
+    travel_mm: Annotated[float, at_least(0, up_to=10_000)] = 36.0
     """Length of the path along the colon, mm. A longer one, with as many frames, makes neighbouring frames less
     alike."""
     light: str | None = None
@@ -48,12 +50,6 @@ class ColonConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where frames are rendered: cpu, cuda (a GPU; needs the extra gpu), or auto, the GPU where there is one and that
     extra is installed."""
-
-    def __post_init__(self) -> None:
-        if self.frames < 1:
-            raise InputError("--frames", f"{self.frames}", "expected at least 1")
-        if min(self.size) < 1:
-            raise InputError("--size", f"{list(self.size)}", "expected a width and a height of some pixels")
 
     def rendered(
         self, scene: TubeConfig, breathing: BreathingConfig, progress: Callable[[int, int], None]
@@ -84,7 +80,7 @@ def synth(
     output: Path,
     colon: Group[ColonConfig] = ColonConfig(),
     layout: Literal["frames", "c3vd", "endomapper"] = "frames",
-    spurious: float | None = None,
+    spurious: Annotated[float | None, BELOW_ONE] = None,
     scene: TubeConfig = TubeConfig(),
     slam: SlamConfig = SlamConfig(),
     errors: MapErrors = MapErrors(),

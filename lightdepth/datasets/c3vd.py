@@ -31,6 +31,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.regular import regular
 from lightdepth.sparse_map import check_rigid
 
 C3VD = Scaramuzza(
@@ -218,6 +219,7 @@ def _colour(path: Path, tree: _Tree) -> dict[int, Path]:
 
 def _read_poses(path: Path) -> np.ndarray:
     """(n, 4, 4) world_from_cam [mm], whichever way the lines were flattened."""
+    regular(path)
     try:
         rows = np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:

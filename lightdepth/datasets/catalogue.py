@@ -19,11 +19,13 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from lightdepth import plain_yaml
 from lightdepth.calibration import camera_from_fields
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.reading import FORMATS
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields
+from lightdepth.regular import regular
 
 _Schema = TypeVar("_Schema", bound=BaseModel)
 
@@ -78,8 +80,9 @@ def read_dataset_yaml(path: Path) -> DatasetInfo:
 
 def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     """A YAML file of ours, read by a safe loader; InputError names the file, and the field or the line."""
+    regular(path)
     try:
-        data = yaml.load(path.read_text(encoding="utf-8-sig"), _Loader)
+        data = plain_yaml.read(path, _Loader)
     except OSError as error:
         raise InputError(
             path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
@@ -91,7 +94,7 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     return checked_fields(schema, data, str(path))
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(plain_yaml.Loader):
     """A safe loader that refuses a key written twice, which YAML's own would take for the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:

@@ -38,6 +38,9 @@ _GOOD = 0.005  # below this median error nothing else is tried
 _LEAST_SEEN = 0.1  # share of the points that have to fall on known distance
 _COMBED = 1.3  # comb ratio from which an image looks interlaced; real progressive endoscopy: 1.01 to 1.22
 
+_LEAST_SIDE = 8
+"""Pixels of a frame's side, below which neighbours and blocks of pixels mean nothing."""
+
 
 def check_sequence(sequence: FrameSequence) -> FrameSequence:
     """The sequence as it is, after a look at the frames it offers for that (`sampled`).
@@ -50,6 +53,11 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
         warnings.warn(f"{sequence.source}: {message}; what needs no truth goes on without it", stacklevel=3)
     if not frames:
         return sequence
+    width, height = frames[0].camera.width, frames[0].camera.height
+    if min(width, height) < _LEAST_SIDE:
+        raise InputError(
+            sequence.source, f"frames of {width}x{height}", f"expected at least {_LEAST_SIDE}x{_LEAST_SIDE}"
+        )
     for message in (
         *_camera_doubts(frames[0].camera),
         *_light_doubts(frames[0].light),

@@ -33,6 +33,7 @@ from lightdepth.datasets.dicom_parts import (
 from lightdepth.datasets.video import VideoFile
 from lightdepth.errors import InputError
 from lightdepth.files.headers import header_in
+from lightdepth.regular import irregular
 
 DICOM_SUFFIXES = (".dcm", ".dicom", ".dic")
 _ELEMENTS = (
@@ -77,6 +78,8 @@ def is_dicom(path: Path) -> bool:
     """Whether a file is DICOM, by its ending or its mark."""
     if path.suffix.lower() in DICOM_SUFFIXES:
         return True
+    if irregular(path):
+        return False
     try:
         with path.open("rb") as stream:
             return stream.read(132)[128:] == b"DICM"

@@ -30,6 +30,7 @@ from lightdepth.files.schema import read_json
 from lightdepth.frame import Frame, check_image_size, frame_number, resized_mask
 from lightdepth.maps import read_map
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.regular import regular
 
 _LEVELS = 6  # folders above the frames in which calibrations are looked for
 GEOMETRY, PHOTOMETRY = "geometrical", "photometrical"
@@ -146,7 +147,7 @@ def _in_cluster(path: Path, images: list[Path]) -> tuple[list[Path], CameraModel
     model = cluster[0] / "sparse" / path.stem
     keyframes = read_map(model).submaps[0].keyframes if model.is_dir() else ()
     if path.suffix == ".txt":
-        names = path.read_text(errors="replace", encoding="utf-8-sig").split()
+        names = regular(path).read_text(errors="replace", encoding="utf-8-sig").split()
         odd = [name for name in names if not re.fullmatch(r"(?:.*[/\\])?out\d+(?:\.\w+)?", name)]
         if odd or not names:
             raise InputError(

@@ -32,6 +32,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame, frame_number
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.regular import regular
 
 _COLUMNS = ("tx", "ty", "tz", "rx", "ry", "rz", "rw")
 _RENDERED = r"image_(\d+)\.(?:png|jpg)"
@@ -149,7 +150,7 @@ def _simulated(path: Path) -> bool:
 def _read_calibration(path: Path) -> CameraModel:
     """`fx: 1.0` and so on, a line each."""
     found = {}
-    for line in path.read_text(errors="replace", encoding="utf-8-sig").splitlines():
+    for line in regular(path).read_text(errors="replace", encoding="utf-8-sig").splitlines():
         key, colon, value = line.partition(":")
         try:
             found[key.strip()] = float(value) if colon else 0.0
@@ -193,7 +194,7 @@ def _poses(path: Path) -> dict[int, np.ndarray]:
 
 
 def _read_csv(path: Path, mm: float) -> dict[int, np.ndarray]:
-    with path.open(newline="", encoding="utf-8-sig", errors="replace") as stream:
+    with regular(path).open(newline="", encoding="utf-8-sig", errors="replace") as stream:
         header = stream.readline()
         between = ";" if ";" in header else ","
         names = [name.strip().lower() for name in header.split(between)]

@@ -29,6 +29,7 @@ from lightdepth.files.images import image_size, read_raw, to_bgr8, write_image
 from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.frame import Frame, check_image_size, frame_number
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.regular import regular
 from lightdepth.which_frame import WhichFrame
 
 
@@ -160,6 +161,7 @@ def write_times(path: Path, times: Mapping[str, float]) -> None:
 def read_times(path: Path) -> dict[str, float]:
     """Times [s] of frames by name."""
     times = {}
+    regular(path, "expected lines NAME,seconds")
     try:
         lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
     except (OSError, UnicodeDecodeError) as error:

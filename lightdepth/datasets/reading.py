@@ -16,7 +16,9 @@ from lightdepth.datasets.format import Format
 from lightdepth.datasets.sequence import FrameSequence, legible, list_images, no_images, read_mask
 from lightdepth.datasets.video_sequence import check_turned, open_clip, read_video, video_at
 from lightdepth.errors import InputError
+from lightdepth.files.below import folders_in
 from lightdepth.files.images import image_size
+from lightdepth.files.reading import reading
 from lightdepth.frame import check_image_size
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.which_frame import Stamps
@@ -46,21 +48,16 @@ def open_sequence(
     `check_sequence` says what is doubtful.
     """
     path = Path(path)
-    try:
-        return check_sequence(_open(path, format, camera, light, mask, map_camera, bit_depth))
-    except InputError as error:
-        cure = ""
-        if path.is_dir() and not _is_cluster(path, format):
-            cure = _other_format(path, format) if format is not None else _folders_below(path)
-        if not cure:
-            raise
-        raise InputError(error.where, error.found, f"{error.cure}{cure}") from error
-    except OSError as error:
-        raise InputError(
-            error.filename or path,
-            f"cannot be read ({error.strerror or error})",
-            "expected files that are there and may be read",
-        ) from error
+    with reading(path, "frames that can be read", "expected files that are there and may be read"):
+        try:
+            return check_sequence(_open(path, format, camera, light, mask, map_camera, bit_depth))
+        except InputError as error:
+            cure = ""
+            if path.is_dir() and not _is_cluster(path, format):
+                cure = _other_format(path, format) if format is not None else _folders_below(path)
+            if not cure:
+                raise
+            raise InputError(error.where, error.found, f"{error.cure}{cure}") from error
 
 
 def stamps_of(path: str | Path, format: str | None = None) -> Stamps:
@@ -151,7 +148,7 @@ def _folders_below(path: Path) -> str:
     found: list[Path] = []
     level = [path]
     for _ in range(_DEEP):
-        below = [p for folder in level for p in sorted(folder.iterdir())[:_MANY] if p.is_dir() and p.name != "truth"]
+        below = [p for folder in level for p in folders_in(folder)[:_MANY] if p.name != "truth"]
         found += [p for p in below if _is_sequence(p)]
         level = [p for p in below if p not in found]
     if not found:

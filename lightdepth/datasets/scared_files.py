@@ -8,14 +8,41 @@ from __future__ import annotations
 import os
 import re
 import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Self
 
 from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
+from lightdepth.files.reading import check_bytes, reading
 
 VIDEO = Path("data") / "rgb.mp4"
 IMAGES = {"left": "Left_Image.png", "right": "Right_Image.png"}
-_LARGEST = 256 << 20  # bytes of one member of an archive: a scene's points are 31 MB
+_LARGEST = 128 << 20
+"""Bytes of one member of an archive: a scene's points are 31 MB."""
+_RECORD = 1 << 20
+"""Bytes of one member that is read with all others: a frame's data are 2 KB."""
+_ALL = 256 << 20
+"""Bytes of an archive that is read whole, once unpacked: the frame data of an hour are as many."""
+_MOST_MEMBERS = 200_000
+_LONGEST_NAME = 1 << 16
+"""Bytes of what a member's name and its other words are kept in: they are unpacked before the member is seen."""
+_HEADER = "a member's header"
+_NOT_NAMES = (tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.DIRTYPE, tarfile.CONTTYPE, tarfile.SYMTYPE, tarfile.LNKTYPE)
+
+
+class _Member(tarfile.TarInfo):
+    """A member whose header is checked as soon as it is read."""
+
+    @classmethod
+    def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
+        member = super().frombuf(buf, encoding, errors)
+        if member.type not in (*_NOT_NAMES, tarfile.GNUTYPE_SPARSE) and member.size > _LONGEST_NAME:
+            raise InputError(_HEADER, f"{member.size} bytes", f"expected at most {_LONGEST_NAME}")
+        if member.size < 0:
+            raise InputError(_HEADER, f"{member.size} bytes", "expected a size")
+        return member
 
 
 class Folder:
@@ -28,9 +55,14 @@ class Folder:
 
     def get(self, number: int) -> tuple[str, bytes] | None:
         file = self._files.get(number)
-        return None if file is None else (str(file), file.read_bytes())
+        if file is None:
+            return None
+        check_bytes(file.stat().st_size, _LARGEST, file)
+        return str(file), file.read_bytes()
 
     def all(self) -> list[tuple[int, str, bytes]]:
+        for file in self._files.values():
+            check_bytes(file.stat().st_size, _RECORD, file)
         return [(n, str(file), file.read_bytes()) for n, file in self._files.items()]
 
 
@@ -44,39 +76,40 @@ class Archive:
         self._found: dict[int, tarfile.TarInfo] = {}
         self._tar: tarfile.TarFile | None = None
         self._complete = False
-        self._process = 0
+        self._members = self._process = 0
 
     def get(self, number: int) -> tuple[str, bytes] | None:
-        try:
+        with self._guarded():
             self._open()
             while number not in self._found and not self._complete:
                 self._next()
             return self._read(number) if number in self._found else None
-        except (OSError, EOFError, tarfile.TarError) as error:
-            raise self._broken(error) from error
 
     def all(self) -> list[tuple[int, str, bytes]]:
         """Every member in the archive's own order, which costs one pass."""
         members = []
-        try:
+        with self._guarded():
             self._open()
             while not self._complete:
                 number = self._next()
+                if self._tar is not None and self._tar.offset > _ALL:
+                    raise InputError(self._path, f"more than {_ALL} bytes once unpacked", f"expected at most {_ALL}")
                 if number is not None:
+                    check_bytes(self._found[number].size, _RECORD, self._path, "member")
                     members.append((number, *self._read(number)))
-        except (OSError, EOFError, tarfile.TarError) as error:
-            raise self._broken(error) from error
         return members
 
     def _open(self) -> None:
         if self._process != os.getpid():  # a data loader's worker must not share the place in the file
-            self._tar = tarfile.open(self._path, "r:*")  # noqa: SIM115 - the next frame goes on from here
-            self._found, self._complete, self._process = {}, False, os.getpid()
+            self._tar = tarfile.open(self._path, "r:*", tarinfo=_Member)  # noqa: SIM115 - the next frame goes on from here
+            self._found, self._complete, self._members, self._process = {}, False, 0, os.getpid()
 
     def _next(self) -> int | None:
         """Steps to the next member; its number, if it is one of ours."""
         assert self._tar is not None
-        member = self._tar.next()
+        member, self._members = self._tar.next(), self._members + 1
+        if self._members > _MOST_MEMBERS:
+            raise InputError(self._path, f"more than {_MOST_MEMBERS} members", "expected one for each frame")
         if member is None:
             self._complete = True
             return None
@@ -97,8 +130,15 @@ class Archive:
         assert stream is not None
         return f"{self._path}: {member.name}", stream.read()
 
-    def _broken(self, error: Exception) -> InputError:
-        return InputError(self._path, f"cannot be read ({error})", "copied incompletely, or not a .tar.gz?")
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        with reading(self._path, "a readable archive", "copied incompletely, or not a .tar.gz?"):
+            try:
+                yield
+            except InputError as error:
+                if error.where != _HEADER:
+                    raise
+                raise error.within(self._path) from error
 
 
 def numbered_members(folder: Path, name: str, pattern: str) -> Folder | Archive | None:

@@ -19,6 +19,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.headers import Header, header_of, what_is_there
 from lightdepth.files.images import ARRAY_SUFFIXES, PICTURE_SUFFIXES, image_size, read_image, read_raw
 from lightdepth.files.masks import read_two_parts
+from lightdepth.files.reading import reading
 from lightdepth.frame import Frame, frame_number
 from lightdepth.sparse_map import Keyframe
 
@@ -73,7 +74,9 @@ class FrameSequence(Sequence[Frame]):
     def __getitem__(self, index: int | slice) -> Frame | FrameSequence:
         if isinstance(index, slice):
             return self.at(range(len(self))[index])
-        return self._load(range(len(self))[index])
+        index = range(len(self))[index]
+        with reading(f"{self.source}: {self.names[index]}", "a frame that can be read"):
+            return self._load(index)
 
     def at(self, rows: Sequence[int]) -> FrameSequence:
         """The frames at these rows, in this order."""

@@ -24,6 +24,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame
 from lightdepth.photometry import PhotometricCalibration
+from lightdepth.regular import regular
 
 FULL_SCALE_MM = 200.0
 _TOP = 255 * 256
@@ -167,6 +168,7 @@ def _read_poses(path: Path) -> np.ndarray | None:
 
 
 def _numbers(path: Path, columns: str) -> np.ndarray:
+    regular(path)
     try:
         rows = np.loadtxt(path, ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:

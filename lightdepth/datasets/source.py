@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.reading import FormatName, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.errors import InputError
+from lightdepth.ranges import Range, checked
 
 
 @dataclass(frozen=True)
+@checked
 class SequenceSource:
     """Frames, and the files that win over what lies beside them."""
 
@@ -30,10 +33,10 @@ class SequenceSource:
     mask: Path | None = None
     """Image, white where tissue shows and black elsewhere, used instead of the folder's own mask. Left out, the
     folder's own, where it has one, else the black border is found."""
-    bit_depth: int | None = None
+    bit_depth: Annotated[int | None, Range(8, 32)] = None
     """Bits of a sample in pictures that are stored in more than 8, e.g. 10 where white is 1023; left out, what the
     files say, else what their highest values show. A larger one reads the same numbers as darker."""
-    fov: float | None = None
+    fov: Annotated[float | None, Range(10, 175)] = None
     """Field of view across the image's width, degrees, at which --camera auto (which it implies) starts, and which is
     assumed where the frames do not connect. A larger one means a shorter focal length. Left out, several are tried."""
 

@@ -31,6 +31,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lightdepth.datasets.catalogue import DatasetInfo, SequenceName, inside, read_dataset_yaml, read_yaml
 from lightdepth.errors import InputError
+from lightdepth.files.below import folders_in
 
 PARTS = ("train", "val", "test")
 _RANGE = re.compile(r"(.+?)\s*\[\s*(\d+)\s*:\s*(\d+)\s*\]")
@@ -258,12 +259,25 @@ def _matches(key: str, names: str | list[str]) -> bool:
 
 
 def located(root: Path, name: str) -> Path | None:
-    """The folder of this name, or the one below the same folder whose name means the same sequence."""
+    """The folder of this name, or the one below the same folder whose name means the same sequence.
+
+    Raises InputError where a link leads out of `root`: a file that names what is read names nothing else."""
+    found = _located(root, name)
+    if found is not None and not found.resolve().is_relative_to(root.resolve()):
+        raise InputError(
+            found,
+            f"is a link that leads out of {root}, to {found.resolve()}",
+            "put the folder itself there",
+        )
+    return found
+
+
+def _located(root: Path, name: str) -> Path | None:
     if (root / name).is_dir():
         return root / name
     above = (root / name).parent
     key = same_sequence(name)
-    siblings = sorted(p for p in above.iterdir() if p.is_dir()) if above.is_dir() else []
+    siblings = folders_in(above) if above.is_dir() else []
     same = [p for p in siblings if same_sequence(f"{name.rpartition('/')[0]}/{p.name}".lstrip("/")) == key]
     if len(same) > 1:
         raise InputError(above, f"{' and '.join(p.name for p in same)} are both {name}", "keep one")

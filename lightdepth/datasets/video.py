@@ -25,11 +25,14 @@ import numpy as np
 
 from lightdepth.datasets.clip import brightened, white_level
 from lightdepth.errors import InputError
+from lightdepth.files.reading import check_pixels, reading
 
 # Formats that hold pictures themselves. Playlists, which name other files or hosts, are not among them.
 _FORMATS = "mov,matroska,avi,mpeg,mpegts,mpegvideo,asf,mxf,flv,mjpeg,ogg,dv,h264,hevc,m4v,nut,ivf,yuv4mpegpipe"
 
 
+_MOST_FRAMES = 10**7
+"""Days of video: a header that announces more is broken."""
 _TECHNICAL = {
     "major_brand",
     "minor_version",
@@ -82,6 +85,11 @@ class VideoFile:
         self._lock = threading.Lock()
         self._decoder: _Decoder | None = None
         self._last: tuple[int, np.ndarray] | None = None
+        with reading(self.path, "a video that can be read"):
+            self._look(bit_depth)
+
+    def _look(self, bit_depth: int | None) -> None:
+        """What the packets and the first picture say."""
         container, stream = self._opened()
         with container:
             codec = stream.codec_context
@@ -92,6 +100,9 @@ class VideoFile:
             time_base, expected = stream.time_base, stream.frames
             index, stamps = _index_of(container, stream)
         self.missing = max(0, expected - len(stamps)) if "mov" in self.format else 0  # others only estimate
+        if self.missing > min(_MOST_FRAMES, 1000 * (len(stamps) + 1)):
+            found = f"the header announces {expected} frames, and {len(stamps)} are in the file"
+            raise InputError(self.path, found, "copy it again")
         first = self._first_decoded()
         if index is not None and first.pts in index.pts:
             index = _from(index, index.pts.index(first.pts))  # what comes before the first keyframe never decodes
@@ -114,7 +125,7 @@ class VideoFile:
 
     def read(self, index: int) -> np.ndarray:
         """Picture (H, W, 3) RGB, uint8, or uint16 where the file has more than 8 bits."""
-        with self._lock:
+        with self._lock, reading(self.path, "a video that can be read"):
             return self._read(range(len(self))[index])
 
     def _read(self, index: int) -> np.ndarray:
@@ -205,6 +216,12 @@ class VideoFile:
                 self.path, "a video in a codec that FFmpeg does not know, or damaged", "convert it to .mp4, with H.264"
             )
         # A process that is forked while a decoder has threads, as a DataLoader's workers are, hangs when it frees it.
+        if stream.width and stream.height:
+            try:
+                check_pixels(stream.width, stream.height, self.path)
+            except InputError:
+                container.close()
+                raise
         stream.thread_type, stream.codec_context.thread_count = "NONE", 1
         return container, stream
 

@@ -122,7 +122,8 @@ def _card(model: NetworkModel, use: list[str]) -> str:
         facts = {key: value for key, value in model.card.items() if isinstance(value, (str, int, float))}
         lines = [f"- {key}: {value}" for key, value in facts.items()]
         errors = model.card.get("errors")
-        lines += [f"- {key}: {value:.4g}" for key, value in errors.items()] if isinstance(errors, dict) else []
+        shown = errors.items() if isinstance(errors, dict) else ()
+        lines += [f"- {key}: {value:.4g}" for key, value in shown if isinstance(value, int | float)]
         network = json.dumps(model.network.config.to_dict())
         known = "\n".join([f"# {model.name}", "", *lines, f"- network: `{network}`"]) + "\n"
     head = ["---", "library_name: lightdepth", "pipeline_tag: depth-estimation", "---", ""]

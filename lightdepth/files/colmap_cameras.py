@@ -10,6 +10,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.errors import InputError
+from lightdepth.files.reading import reading
 from lightdepth.files.text import numbered_lines, parse_integer, parse_numbers
 
 _BINARY_MODELS = {  # model number in cameras.bin -> name, number of parameters
@@ -36,6 +37,11 @@ _BINARY_MODELS = {  # model number in cameras.bin -> name, number of parameters
 
 def read_cameras_text(path: Path) -> dict[int, CameraModel]:
     """Cameras by id, in the file's own pixel convention."""
+    with reading(path, "COLMAP's cameras"):
+        return _cameras_text(path)
+
+
+def _cameras_text(path: Path) -> dict[int, CameraModel]:
     expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
     cameras = {}
     for number, line in numbered_lines(path):
@@ -55,12 +61,8 @@ class BinaryFile:
 
     def __init__(self, path: Path) -> None:
         self.path, self.at = path, 0
-        try:
+        with reading(path, "a COLMAP binary file"):
             self.data = path.read_bytes()
-        except OSError as error:
-            raise InputError(
-                path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
-            ) from error
 
     def take(self, layout: str) -> tuple[Any, ...]:
         size = struct.calcsize("<" + layout)
@@ -100,6 +102,12 @@ class BinaryFile:
 
 
 def read_cameras_binary(path: Path) -> dict[int, CameraModel]:
+    """Cameras by id, in the file's own pixel convention."""
+    with reading(path, "COLMAP's cameras"):
+        return _cameras_binary(path)
+
+
+def _cameras_binary(path: Path) -> dict[int, CameraModel]:
     data, cameras = BinaryFile(path), {}
     for _ in range(data.take("Q")[0]):
         camera_id, model, width, height = data.take("IiQQ")

@@ -16,7 +16,9 @@ import numpy as np
 
 from lightdepth.errors import InputError
 from lightdepth.files.headers import what_is_there
+from lightdepth.files.reading import MOST_PIXELS, check_bytes, reading
 
+_MOST_BYTES, _MOST_CHANNELS = 1 << 30, 64
 _MAGIC = struct.pack("<i", 20000630)
 _LINES = {0: 1, 2: 1, 3: 16}  # in a block, by compression: none, ZIPS, ZIP
 _COMPRESSIONS = ("none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
@@ -55,10 +57,9 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
     """The channels (H, W) by name. Raises InputError for what is none, is broken, or is stored in another way."""
     if not path.is_file():  # a named pipe would wait for ever
         raise InputError(path, what_is_there(path), "expected an EXR file")
-    try:
+    with reading(path, "an EXR file"):
+        check_bytes(path.stat().st_size, _MOST_BYTES, path)
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror or error})", "expected an EXR file") from error
     if data[:4] != _MAGIC:
         raise InputError(path, "not an EXR file", "copy it again, or leave it out")
     try:
@@ -66,10 +67,10 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
         return _channels(data, head)
     except InputError:
         raise
-    except (struct.error, IndexError, KeyError, UnicodeDecodeError, zlib.error, MemoryError) as error:
-        raise InputError(path, "a broken EXR file (cut off, or changed)", "copy it again, or leave it out") from error
     except ValueError as error:
         raise InputError(path, f"a broken EXR file ({error})", "copy it again, or leave it out") from error
+    except Exception as error:  # whatever its offsets and lengths lead to
+        raise InputError(path, "a broken EXR file (cut off, or changed)", "copy it again, or leave it out") from error
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,10 @@ def _header(data: bytes, path: Path) -> _Head:
         names.append((name, _TYPES[kind]))
         at += 16
     width, height = right - left + 1, bottom - top + 1
-    if not names or not (0 < width < 2**16 and 0 < height < 2**16):
+    if not 0 < len(names) <= _MOST_CHANNELS or not (0 < width < 2**16 and 0 < height < 2**16):
         raise ValueError(f"{len(names)} channels of {width}x{height}")
+    if width * height * len(names) > 4 * MOST_PIXELS:
+        raise InputError(path, f"{len(names)} channels of {width}x{height}", f"expected up to {MOST_PIXELS} pixels")
     return _Head(tuple(names), width, height, top, compression, place + 1)
 
 

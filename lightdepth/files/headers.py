@@ -18,6 +18,8 @@ import numpy as np
 from PIL import Image
 
 from lightdepth.errors import InputError
+from lightdepth.files.reading import MOST_PIXELS
+from lightdepth.regular import irregular
 
 _ORIENTATION, _WIDTH, _HEIGHT, _BITS, _SUBFILE, _SAMPLE_FORMAT = 274, 256, 257, 258, 254, 339
 _EXTRA_SAMPLES = 338
@@ -52,19 +54,17 @@ def header_of(path: Path) -> Header | None:
     if not path.is_file():  # a named pipe would wait for ever
         raise InputError(path, what_is_there(path), "expected an image file")
     with path.open("rb") as stream:
-        return _read(stream)
+        return _read(stream, str(path))
 
 
-def header_in(data: bytes) -> Header | None:
-    """The header in a file's bytes."""
-    return _read(io.BytesIO(data))
+def header_in(data: bytes, where: str = "a picture") -> Header | None:
+    """The header in a file's bytes; `where` names them in errors."""
+    return _read(io.BytesIO(data), where)
 
 
 def what_is_there(path: Path) -> str:
     """What stands at a path that is no file, for messages."""
-    if not path.exists():
-        return "no such image"
-    return "a folder, not a file" if path.is_dir() else "a named pipe or a device, not a file"
+    return f"{irregular(path)}, not a file" if path.exists() else "no such image"
 
 
 def as_stored(data: bytes) -> bytes:
@@ -79,16 +79,19 @@ def as_stored(data: bytes) -> bytes:
     return bytes(changed) if places else data
 
 
-def _read(stream: BinaryIO) -> Header | None:
+def _read(stream: BinaryIO, where: str) -> Header | None:
     start = stream.read(8)
     stream.seek(0)
-    with suppress(OSError, ValueError, struct.error, KeyError, IndexError, SyntaxError, EOFError):
+    try:
         if start[:6] == _NPY:
             return _npy(stream)
         if start[:2] in (b"II", b"MM") and start[2:4] in (b"*\0", b"\0*", b"+\0", b"\0+"):
             return _tiff(stream)
         return _png(stream) if start == b"\x89PNG\r\n\x1a\n" else _others(stream)
-    return None
+    except Image.DecompressionBombError as error:
+        raise InputError(where, "more than 178 million pixels", f"expected up to {MOST_PIXELS}") from error
+    except Exception:  # whatever a broken header makes a parser stumble over: there is no legible one
+        return None
 
 
 def _others(stream: BinaryIO) -> Header:

@@ -7,7 +7,6 @@ by `files.depths.white_of`, and handed to `read_image`.
 
 from __future__ import annotations
 
-import io
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,10 @@ import cv2
 import numpy as np
 
 from lightdepth.errors import InputError
+from lightdepth.files.arrays import array_in
 from lightdepth.files.headers import Header, as_stored, header_in, header_of, what_is_there
+from lightdepth.files.machine import FAILS
+from lightdepth.files.reading import check_bytes, check_pixels, reading
 
 PICTURE_SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".dib", ".tif", ".tiff", ".webp", ".jp2", ".j2k"),
@@ -24,6 +26,7 @@ PICTURE_SUFFIXES = (
 )
 ARRAY_SUFFIXES = (".npy",)
 """Arrays serve as pictures where there are no others: beside pictures they are predictions or truth."""
+_MOST_BYTES = 1 << 30
 _DECODE = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
 
 
@@ -80,12 +83,9 @@ def read_bytes(path: Path, what: str = "file") -> bytes:
         if path.exists():
             raise InputError(path, what_is_there(path), f"expected the {what} itself")
         raise InputError(path, f"no such {what}", "correct its name, or put it there")
-    try:
+    with reading(path, f"a {what}"):
+        check_bytes(path.stat().st_size, _MOST_BYTES, path, what)
         return path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
-        ) from error
 
 
 def read_raw(path: Path) -> np.ndarray:
@@ -108,6 +108,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height as stored, from the file's header alone where it has a legible one."""
     head = header_of(path)
     if head is not None and head.width:
+        check_pixels(head.width, head.height, path)
         return head.width, head.height
     height, width = read_pixels(path).shape[:2]
     return width, height
@@ -121,6 +122,9 @@ def write_image(path: Path, pixels: np.ndarray, quality: int | None = None) -> N
     try:
         path.write_bytes(data.tobytes())
     except OSError as error:
+        if error.errno in FAILS:
+            error.filename = str(path)  # writing alone names none
+            raise
         raise InputError(path, f"cannot be written ({error.strerror or error})", "choose another place") from error
 
 
@@ -128,7 +132,9 @@ def _single(data: bytes, where: str) -> Header | None:
     """The header of what is one picture."""
     if not data:
         raise InputError(where, "not a readable image (the file is empty, 0 bytes)", "copy it again, or leave it out")
-    head = header_in(data)
+    head = header_in(data, where)
+    if head is not None and head.kind != "NPY":
+        check_pixels(head.width, head.height, where)
     if head is not None and head.pages > 1:
         raise InputError(
             where,
@@ -140,7 +146,10 @@ def _single(data: bytes, where: str) -> Header | None:
 
 def decode(data: bytes, flags: int, where: str, head: Header | None = None) -> np.ndarray:
     """cv2's image in a file's bytes. imdecode refuses a truncated JPEG, whose rest imread would paint grey."""
+    head = head or header_in(data, where)
     buffer, image = np.frombuffer(as_stored(data) if head is not None and head.kind == "TIFF" else data, np.uint8), None
+    if head is None:  # its size is not known before it is decoded
+        raise InputError(where, "not a readable image (no header that is known)", "copy it again, or leave it out")
     with suppress(cv2.error):  # of sizes and channels that it does not know
         image = cv2.imdecode(buffer, flags)
     if image is None and flags == _DECODE and head is not None and head.deep:
@@ -155,10 +164,9 @@ def decode(data: bytes, flags: int, where: str, head: Header | None = None) -> n
 
 
 def _array(data: bytes, where: str) -> np.ndarray:
-    try:
-        array: np.ndarray = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise InputError(where, f"not a readable array ({error})", "expected one of numbers, (H, W, 3)") from error
+    array = array_in(data, where, "a readable array", "expected one of numbers, (H, W, 3)")
+    if array.ndim > 1:
+        check_pixels(array.shape[1], array.shape[0], where)
     return array
 
 

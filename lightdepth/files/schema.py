@@ -10,14 +10,16 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from lightdepth.errors import InputError
+from lightdepth.regular import regular
 
 _Schema = TypeVar("_Schema", bound=BaseModel)
 
 
 def read_json(path: Path) -> Any:
     """Parsed JSON, with the file named in every error."""
+    regular(path)
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8-sig"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(
             path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
@@ -26,6 +28,8 @@ def read_json(path: Path) -> Any:
         raise InputError(path, f"not UTF-8 (at byte {error.start})", "save it as UTF-8") from error
     except ValueError as error:
         raise InputError(path, f"not valid JSON ({error})", "correct it there") from error
+    except RecursionError as error:
+        raise InputError(path, "not valid JSON (brackets in one another without end)", "correct it there") from error
 
 
 def checked_fields(schema: type[_Schema], data: Any, where: str) -> _Schema:

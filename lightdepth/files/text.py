@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from lightdepth.errors import InputError
+from lightdepth.files.reading import MOST_TEXT, check_bytes
+from lightdepth.regular import regular
 
 
 def read_text(path: Path, expected: str) -> str:
     """The file's text; `expected` ends the message when it is something else."""
     try:
+        check_bytes(regular(path, expected).stat().st_size, MOST_TEXT, path, "text")
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror or error})", expected) from error
@@ -36,7 +39,7 @@ def to_numbers(words: list[str], where: str, expected: str) -> list[float]:
         try:
             numbers.append(float(word))
         except ValueError:
-            raise InputError(where, f"found {word!r}, which is not a number", f"expected {expected}") from None
+            raise InputError(where, f"found {word[:60]!r}, which is not a number", f"expected {expected}") from None
         if not np.isfinite(numbers[-1]):
             raise InputError(where, f"{word} is not finite", f"expected {expected}")
     return numbers
@@ -44,7 +47,7 @@ def to_numbers(words: list[str], where: str, expected: str) -> list[float]:
 
 def text_lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8-sig").split("\n")
+        return regular(path).read_text(encoding="utf-8-sig").split("\n")
     except OSError as error:
         raise InputError(
             path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
@@ -74,12 +77,17 @@ def parse_numbers(tokens: list[str], where: str, expected: str) -> np.ndarray:
             try:
                 float(token)
             except ValueError:
-                raise InputError(where, f"found {token!r}, which is not a number", f"expected {expected}") from None
+                raise InputError(
+                    where, f"found {token[:60]!r}, which is not a number", f"expected {expected}"
+                ) from None
         raise
 
 
 def parse_integer(token: str, where: str, expected: str) -> int:
     try:
-        return int(token)
+        number = int(token)
     except ValueError:
-        raise InputError(where, f"found {token!r}, which is not an integer", f"expected {expected}") from None
+        raise InputError(where, f"found {token[:60]!r}, which is not an integer", f"expected {expected}") from None
+    if abs(number) >= 2**63:
+        raise InputError(where, f"found {token[:60]}, an integer of more than 63 bits", f"expected {expected}")
+    return number

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightdepth.errors import InputError
+from lightdepth.files.reading import LARGEST_NUMBER, reading
 
 
 def write_tum(path: Path, times: Iterable[float], world_from_cam: Iterable[np.ndarray]) -> None:
@@ -25,17 +26,16 @@ def write_tum(path: Path, times: Iterable[float], world_from_cam: Iterable[np.nd
 def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,) and poses world_from_cam (n, 4, 4) of a TUM trajectory, or of KITTI's poses, whose times are the
     numbers of the frames."""
-    try:
-        rows = np.loadtxt(path, ndmin=2, encoding="utf-8-sig")
-    except (OSError, ValueError) as error:
-        raise InputError(
-            path, f"not a TUM trajectory ({error})", "expected lines of 8 numbers: t tx ty tz qx qy qz qw"
-        ) from error
+    with reading(path, "a TUM trajectory", "expected lines of 8 numbers: t tx ty tz qx qy qz qw"):
+        rows: np.ndarray = np.loadtxt(path, ndmin=2, encoding="utf-8-sig")
     if rows.shape[1] not in (8, 12):
         raise InputError(path, f"{rows.shape[1]} columns", "expected 8: t tx ty tz qx qy qz qw, or 12 (KITTI's poses)")
     if not np.isfinite(rows).all():
         line = int((~np.isfinite(rows)).any(1).argmax()) + 1
         raise InputError(path, f"line {line} has NaN or infinite numbers", "expected a pose for each frame")
+    if (beyond := np.abs(rows) > LARGEST_NUMBER * 1e10).any() or np.abs(rows[:, 1:]).max(initial=0) > LARGEST_NUMBER:
+        line = int((beyond | (np.abs(rows) > LARGEST_NUMBER)).any(1).argmax()) + 1
+        raise InputError(path, f"line {line} has numbers beyond {LARGEST_NUMBER:g}", "expected a pose for each frame")
     if rows.shape[1] == 12:
         return _kitti(rows, path)
     length = np.linalg.norm(rows[:, 4:], axis=1)

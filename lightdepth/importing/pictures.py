@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -11,7 +11,6 @@ import numpy as np
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.folder import write_times
-from lightdepth.errors import InputError
 from lightdepth.files.images import write_image
 from lightdepth.image_quality import eight_bits, one_field
 from lightdepth.importing.page import Picture
@@ -19,6 +18,7 @@ from lightdepth.importing.regions import Regions
 from lightdepth.importing.scan import Scan
 from lightdepth.importing.selection import BLURRED, DOUBLE, FROZEN, KEPT
 from lightdepth.importing.source import Source
+from lightdepth.ranges import PIXELS, checked
 from lightdepth.reporting.figures import thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run
@@ -30,10 +30,11 @@ _EXAMPLES = 8
 
 
 @dataclass(frozen=True)
+@checked
 class PictureConfig:
     """How pictures are cut, resized and freed of interlacing."""
 
-    size: tuple[int, int] | None = None
+    size: Annotated[tuple[int, int] | None, PIXELS] = None
     """Width and height to resize the frames to, pixels, after --crop, the camera with them; left out, they keep theirs.
     A larger one keeps finer detail, up to the frames' own size; other proportions than theirs stretch the picture."""
     crop: Literal["none", "auto"] = "none"
@@ -42,10 +43,6 @@ class PictureConfig:
     deinterlace: bool = False
     """Keep the even rows of each frame and interpolate the odd ones, for interlaced video, where moving edges look like
     combs; switched off, frames stay as they are."""
-
-    def __post_init__(self) -> None:
-        if self.size is not None and min(self.size) < 1:
-            raise InputError("--size", f"{self.size}", "expected a positive width and height")
 
 
 @dataclass(frozen=True)

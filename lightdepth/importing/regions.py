@@ -17,6 +17,9 @@ from lightdepth.image_quality import eight_bits, one_field
 from lightdepth.importing.overlay import STRETCH, STRETCHES, Overlay, find_overlay
 from lightdepth.importing.source import Source
 
+_SHOWN = 4
+"""Of 255: no pixel of a picture that shows nothing at all is as bright."""
+
 
 @dataclass(frozen=True)
 class Regions:
@@ -39,6 +42,10 @@ def find_regions(source: Source, find_text: bool, given_text: np.ndarray | None,
             images.append(one_field(pixels) if deinterlace else pixels)
     if not images:
         raise InputError("the frames", "none of those looked at could be read", "copy the data again")
+    if max(int(image.max()) for image in images) < _SHOWN:
+        raise InputError(
+            "the frames", "all of those looked at are black", "choose a part with --start that shows something"
+        )
     floats = [unit_range(image) for image in images]
     mask, region = border_mask(floats), border_region(floats)
     nothing = np.zeros(mask.shape, bool)

@@ -3,37 +3,40 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.ndimage import percentile_filter
 
 from lightdepth.errors import InputError
 from lightdepth.image_quality import Measures, doubles, repeats
+from lightdepth.ranges import BELOW_ONE, above, at_least, checked
 
 KEPT, PASSED, BLURRED, UNREADABLE = "kept", "passed over", "blurred", "unreadable"
 FROZEN, DOUBLE = "frozen", "double"
 
 
 @dataclass(frozen=True)
+@checked
 class Choice:
     """Which frames to keep."""
 
-    rate: float | None = None
+    rate: Annotated[float | None, above(0, up_to=10_000)] = None
     """Number of frames to keep per second, the sharpest of each interval; left out, 5 for a video, and all of a folder.
     More keep more frames; not with --every."""
-    every: int | None = None
+    every: Annotated[int | None, at_least(1)] = None
     """Number N of which every N-th frame is kept, counted over all frames from --start on, unless it is blurred or
     frozen; instead of a rate per second. More keep fewer frames."""
-    start: float = 0.0
+    start: Annotated[float, at_least(0)] = 0.0
     """Time before which frames are left out, seconds from the first frame. A larger one leaves out more at the
     beginning."""
-    end: float | None = None
+    end: Annotated[float | None, at_least(0)] = None
     """Time after which frames are left out, seconds from the first frame; left out itself, all are kept to the last. A
     larger one keeps more."""
-    blur: float = 0.6
+    blur: Annotated[float, BELOW_ONE] = 0.6
     """Share, in [0, 1), of the sharpness that the best quarter of the frames within about a second before and after
     reach, below which a frame is left out as blurred; 0 leaves out none as blurred. A larger one leaves out more."""
-    max_frames: int | None = None
+    max_frames: Annotated[int | None, at_least(1)] = None
     """Largest number of frames to keep; where the other options keep more, this number of those is taken, evenly. A
     larger one keeps more frames; without it there is no limit."""
 
@@ -44,14 +47,6 @@ class Choice:
             raise InputError(
                 "--rate, --every", f"{self.rate} and {self.every}, which are both given", "give one of them"
             )
-        if self.rate is not None and not self.rate > 0:
-            raise InputError("--rate", f"{self.rate}", "expected frames per second above 0")
-        if self.every is not None and self.every < 1:
-            raise InputError("--every", f"{self.every}", "expected 1 or more")
-        if not 0 <= self.blur < 1:
-            raise InputError("--blur", f"{self.blur}", "expected a share of at least 0 and below 1")
-        if self.max_frames is not None and self.max_frames < 1:
-            raise InputError("--max-frames", f"{self.max_frames}", "expected 1 or more")
 
 
 def selected(times: np.ndarray, measures: Measures, choice: Choice) -> np.ndarray:

@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
+from lightdepth.ranges import ANY, Range, above, at_least, checked
 from lightdepth.sparse_map import Keyframe
 from lightdepth.which_frame import Clock, Stamps, frame_number
 
@@ -99,26 +100,27 @@ class _Sidecar(BaseModel):
 
 
 @dataclass(frozen=True, kw_only=True)
+@checked
 class MapReading:
     """How a map's keyframes are told apart and meet their frames, where its files leave it open."""
 
     map_folder: str | None = None
     """Folder of images in the map whose keyframes are taken, where it holds several (left, right; two clips)."""
-    map_sensor: int | None = None
+    map_sensor: Annotated[int | None, at_least(0, up_to=2**32)] = None
     """Id of the camera, as in a COLMAP map's own files, whose keyframes are taken where it holds several, such as a
     stereo rig's left one; other maps have none. Another one takes another camera's keyframes; left out, all are taken,
     or an error lists the ids where two share frame numbers."""
-    frame_offset: int = 0
+    frame_offset: Annotated[int, ANY] = 0
     """Number of frames added to a keyframe's number, where the map counts from elsewhere: -1 where it counts from 1 and
     the frames from 0. A larger one matches each keyframe with a later frame."""
-    map_fps: float | None = None
+    map_fps: Annotated[float | None, above(0)] = None
     """Frames per second by which a map's times, in seconds, become frame numbers; it wins over the map's own rate and
     the frames' stamps, unless both are on one clock such as Unix time. A higher one gives each time a later frame; maps
     that name frames by number do not need it."""
-    time_offset: float | None = None
+    time_offset: Annotated[float | None, Range(-1e12, 1e12)] = None
     """What the map's clock shows at the time 0 of the frames, seconds; left out, it is found where the clock is
     another one, such as Unix time, and said. A larger one makes earlier frames of the keyframes."""
-    time_tolerance: float | None = None
+    time_tolerance: Annotated[float | None, above(0)] = None
     """How far a keyframe's time may be from the stamp of its frame, seconds; left out, half a frame. A larger one
     accepts poorer stamps."""
 

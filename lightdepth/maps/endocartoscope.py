@@ -24,6 +24,7 @@ from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.colmap_cameras import read_cameras_text
+from lightdepth.files.reading import reading
 from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
 from lightdepth.files.text import is_comment, parse_numbers, text_lines
 from lightdepth.maps.checks import checked, guessed
@@ -66,8 +67,12 @@ def read_trajectory(path: Path) -> list[TrajectoryPose]:
 
     The exporter's header names a column dataset_id that its rows lack: nothing is read beyond the frame state.
     """
+    with reading(path, "a trajectory"):
+        return _poses_of(Path(path))
+
+
+def _poses_of(path: Path) -> list[TrajectoryPose]:
     expected = "timestamp,name_image,tx,ty,tz,qw,qx,qy,qz[,frame_state,...]"
-    path = Path(path)
     poses = []
     for number, line in enumerate(text_lines(path), 1):
         if is_comment(line):

@@ -33,6 +33,7 @@ from lightdepth.camera import (
     opencv_camera,
 )
 from lightdepth.errors import InputError
+from lightdepth.files.reading import check_bytes, reading
 from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
 from lightdepth.files.schema import read_json
 from lightdepth.files.tum import read_tum
@@ -41,6 +42,9 @@ from lightdepth.maps.convention import EXPORTER, MapConvention, Reader
 from lightdepth.sparse_map import Keyframe, Submap, at_its_place
 from lightdepth.which_frame import Clock, frame_number
 
+_MOST_BYTES = 1 << 30
+_LONGEST = 2**16
+"""Numbers of keypoints of a keyframe: msgpack makes room for a list when it is announced, at each of 512 depths."""
 Begun = tuple[float, str] | None
 _LENSES = {  # model_type -> the fields of its distortion; Perspective has a k3 besides, which older versions leave out
     "Perspective": ("k1", "k2", "p1", "p2"),
@@ -94,16 +98,9 @@ def _content(path: Path) -> Mapping[str, Any]:
     if path.suffix.lower() == ".json":
         content = read_json(path)
     else:
-        try:
-            content = msgpack.unpackb(path.read_bytes(), strict_map_key=False)
-        except OSError as error:
-            raise InputError(
-                path, f"cannot be read ({error.strerror or error})", "expected a file that is there and may be read"
-            ) from error
-        except (ValueError, msgpack.exceptions.UnpackException) as error:
-            raise InputError(
-                path, f"not msgpack, or copied incompletely ({error or type(error).__name__})", "copy it again"
-            ) from error
+        with reading(path, "msgpack, or copied incompletely", "copy it again"):
+            check_bytes(path.stat().st_size, _MOST_BYTES, path, "map")
+            content = msgpack.unpackb(path.read_bytes(), strict_map_key=False, max_array_len=_LONGEST)
     if not isinstance(content, dict):
         raise InputError(path, f"found {type(content).__name__}", "expected a map with cameras, keyframes, landmarks")
     return content

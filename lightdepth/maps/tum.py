@@ -21,6 +21,7 @@ from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.colmap_cameras import read_cameras_text
+from lightdepth.files.meshes import read_cloud
 from lightdepth.files.text import is_comment, parse_numbers, text_lines
 from lightdepth.files.tum import read_tum
 from lightdepth.maps.checks import guessed
@@ -146,27 +147,12 @@ def _camera(folder: Path, convention: MapConvention, reader: Reader) -> CameraMo
 def _read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Point ids (n,) and points (n, 3); ids count from 0 where the file has none."""
     if path.suffix.lower() == ".ply":
-        points = _read_ply(path)
+        points = read_cloud(path)
     elif _columns(path) == 3:
         points = _read_xyz(path)
     else:
         return read_points_text(path)
     return np.arange(len(points), dtype=np.int64), points
-
-
-def _read_ply(path: Path) -> np.ndarray:
-    import trimesh
-
-    try:
-        vertices = getattr(trimesh.load(path, process=False), "vertices", None)
-        points = np.array([] if vertices is None else vertices, np.float64).reshape(-1, 3)
-    except Exception as error:  # whatever a broken header makes the reader stumble over
-        raise InputError(
-            path, f"not a PLY that can be read ({type(error).__name__}: {error})", "expected a PLY with vertices x y z"
-        ) from error
-    if not len(points):
-        raise InputError(path, "no points in it", "expected a PLY with vertices x y z")
-    return points
 
 
 def _read_xyz(path: Path) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -26,15 +26,19 @@ from lightdepth.network.heads import (
 from lightdepth.network.tiny import TinyUNet
 from lightdepth.network.unet import ResNetUNet
 from lightdepth.photometry import LightTerms
+from lightdepth.ranges import SHARE, at_least, checked
 
 Input = Literal["rgb", "closed_form", "ray_z", "mask", "reflectance"]
 Encoder = Literal["resnet18", "resnet34", "resnet50", "vitt14", "vits14", "vitb14", "vitl14"]
 KINDS = ("tiny", "unet", "dpt")
 ENCODERS = {"tiny": (), "unet": tuple(unet.ENCODERS), "dpt": tuple(dpt.ENCODERS)}
+MAX_WIDTH = 256
+"""Of the tiny network, which then has 130 million weights: a file that asks for more is no checkpoint of ours."""
 _DEFAULT_ENCODER = {"unet": "resnet18", "dpt": "vits14"}
 
 
 @dataclass(frozen=True)
+@checked
 class NetworkConfig:
     """Which network. Plain values, so that it travels as JSON inside a checkpoint."""
 
@@ -56,18 +60,19 @@ class NetworkConfig:
     uncertainty: bool = False
     """true: the network also says how uncertain it is at each pixel, the standard deviation of log distance; it learns
     that where --model.loss.uncertainty is above 0. false: it gives distance and albedo (the wall's colour) only."""
-    width: int = 16
+    width: Annotated[int, at_least(1, up_to=1024)] = 16
     """Number of channels of the first level of the tiny network; deeper levels have 2 to 6 times as many, and other
     kinds do not use it. More make a stronger and slower network."""
     norm: Literal["batch", "group"] = "group"
     """How the tiny network normalises its channels: "batch", by mean and deviation over all images of a batch; "group",
     over groups of channels of each image by itself, whatever the size of the batch. Other kinds do not use it."""
-    blur: float = 0.018
+    blur: Annotated[float, SHARE] = 0.018
     """Deviation (sigma) of the Gaussian blur of the closed form (distance from brightness alone), as network input and
     under the output "residual", as a share of the image height; 0 for none. A larger one leaves less of the image's
     texture in it."""
 
     def __post_init__(self) -> None:
+        _check_plain(self)
         object.__setattr__(self, "inputs", tuple(self.inputs))  # JSON has lists
         unknown = [name for name in self.inputs if name not in CHANNELS]
         if unknown or not self.inputs:
@@ -85,8 +90,12 @@ class NetworkConfig:
         elif self.encoder not in ENCODERS[self.kind]:
             known = ", ".join(ENCODERS[self.kind]) or "none"
             raise InputError("network encoder", f"{self.encoder!r} of {self.kind} is not known", f"expected {known}")
-        if self.width < 1 or self.blur < 0:
-            raise InputError("network", f"width {self.width}, blur {self.blur}", "expected width > 0 and blur >= 0")
+        if not 1 <= self.width <= MAX_WIDTH or not 0 <= self.blur <= 1:
+            raise InputError(
+                "network",
+                f"width {self.width}, blur {self.blur}",
+                f"expected width > 0, at most {MAX_WIDTH}, and blur >= 0, at most 1",
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON and for checkpoints that load without pickle."""
@@ -99,8 +108,23 @@ class NetworkConfig:
             return cls(**values)
         except TypeError as error:
             raise InputError(
-                "network configuration", f"{values}: {error}", "was it written by another version of the program?"
+                "network configuration", f"{error}", "was it written by another version of the program?"
             ) from error
+
+
+def _check_plain(config: NetworkConfig) -> None:
+    """Raises InputError for values of another kind, as a file of anyone's may have them, before they are shown."""
+    words = ("kind", "output", "norm")
+    fits = all(isinstance(getattr(config, name), str) for name in words)
+    fits &= config.encoder is None or isinstance(config.encoder, str)
+    fits &= isinstance(config.inputs, (list, tuple)) and len(config.inputs) <= len(CHANNELS)
+    fits = fits and all(isinstance(name, str) for name in config.inputs)
+    fits &= isinstance(config.uncertainty, bool) and isinstance(config.width, int)
+    fits &= isinstance(config.blur, (int, float))
+    if not fits:
+        raise InputError(
+            "network configuration", "values of another kind", "was it written by another version of the program?"
+        )
 
 
 class Estimate(NamedTuple):

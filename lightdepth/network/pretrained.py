@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from lightdepth.errors import InputError
+from lightdepth.files.weights import check_header, read_pickled
 from lightdepth.network import dpt, unet
 from lightdepth.network.heads import CHANNELS
 from lightdepth.network.model import DepthNetwork
@@ -82,9 +83,10 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     state: Any
     try:
         if path.suffix == ".safetensors":
+            check_header(path, "expected a state dict as .safetensors or .pth")
             state = load_file(str(path))
         elif path.suffix in (".pth", ".pt"):
-            state = torch.load(path, map_location="cpu", weights_only=True)
+            state = read_pickled(path, "expected a state dict as .safetensors or .pth")
         else:
             raise InputError(path, "unknown kind of weights", "expected a name that ends in .safetensors or .pth")
     except InputError:

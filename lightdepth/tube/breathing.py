@@ -8,37 +8,29 @@ and so does the path of the endoscope.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from lightdepth.errors import InputError
+from lightdepth.ranges import Range, above, at_least, checked
 from lightdepth.tube.shape import TubeShape, wall_normals
 
 
 @dataclass(frozen=True)
+@checked
 class BreathingConfig:
     """How the wall of a colon moves."""
 
-    amplitude: float = 0.0
+    amplitude: Annotated[float, Range(0, 0.3)] = 0.0
     """Largest change of the colon's radius, as a share of it, up to 0.3; 0 keeps the wall still, and more needs
     --slam.kind tracked. A larger one moves the wall more."""
-    period: float = 4.0
+    period: Annotated[float, above(0)] = 4.0
     """Time from one breath (or wave) to the next, seconds; without an amplitude it does nothing. A longer one moves the
     wall more slowly."""
-    wavelength_mm: float = 0.0
+    wavelength_mm: Annotated[float, at_least(0)] = 0.0
     """Distance from one wave to the next along the colon (peristalsis), mm; 0 lets the whole colon widen and narrow at
     once. A larger one makes longer waves; without an amplitude there are none."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.amplitude <= 0.3:
-            raise InputError("breathing.amplitude", f"{self.amplitude}", "expected a share from 0 to 0.3")
-        if not self.period > 0 or not 0 <= self.wavelength_mm < np.inf:
-            raise InputError(
-                "breathing",
-                f"period {self.period}, wavelength_mm {self.wavelength_mm}",
-                "expected a period above 0 and a wavelength of at least 0",
-            )
 
 
 class Breathing:

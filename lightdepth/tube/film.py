@@ -7,32 +7,35 @@ surface of the film is tilted, along s and along phi. Lengths in mm.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from lightdepth.ranges import SHARE, above, at_least, checked, ends_of
 from lightdepth.tube.shape import smooth_noise
 
 
 @dataclass(frozen=True)
+@checked
 class FilmConfig:
     """Ranges of what lies on the wall; all of it is off."""
 
-    mucus: tuple[float, float] = (0.0, 0.0)
+    mucus: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of the share of the wall under a film of mucus. A larger one covers more of it; (0, 0) makes
     none."""
-    mucus_tint: tuple[float, float] = (0.0, 0.4)
+    mucus_tint: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.4)
     """Ends of the range of the share of the wall's colour that mucus hides where it lies (see mucus). A larger one
     makes mucus more opaque."""
-    bubbles: tuple[int, int] = (0, 0)
+    bubbles: Annotated[tuple[int, int], ends_of(at_least(0, up_to=10_000))] = (0, 0)
     """Least and largest number of clusters of 3 to 29 bubbles each in a colon. More hide more of the wall."""
-    bubble_radius: tuple[float, float] = (0.5, 1.8)
+    bubble_radius: Annotated[tuple[float, float], ends_of(above(0, up_to=1000))] = (0.5, 1.8)
     """Ends of the range of the radius of the largest bubbles of a cluster, mm; the others go down to 0.4 of it. A
     larger one makes larger bubbles."""
-    stool: tuple[int, int] = (0, 0)
+    stool: Annotated[tuple[int, int], ends_of(at_least(0, up_to=10_000))] = (0, 0)
     """Least and largest number of specks of stool in a colon. More hide more of the wall."""
-    stool_radius: tuple[float, float] = (0.4, 2.5)
+    stool_radius: Annotated[tuple[float, float], ends_of(above(0, up_to=1000))] = (0.4, 2.5)
     """Ends of the range of the radius of a speck of stool, mm. A larger one makes larger specks."""
 
 

@@ -17,69 +17,55 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import overload
+from typing import Annotated, overload
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from lightdepth.errors import InputError
+from lightdepth.ranges import SHARE, Range, at_least, checked
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap, typical_distance
 
 
 @dataclass(frozen=True)
+@checked
 class MapErrors:
     """Errors of a map that neighbouring points share, each with its size; left as they are, there are none."""
 
-    drift: float = 1.0
+    drift: Annotated[float, Range(0.1, 10)] = 1.0
     """Scale of each submap at the beginning of its path, as a factor of that at the end, from 0.1 to 10, changing
     steadily between; 1 is no drift. A larger one makes the beginning larger; below 1 it is smaller than the end."""
-    side_share: float = 0.0
+    side_share: Annotated[float, SHARE] = 0.0
     """Share, in [0, 1], of a submap's points, all on one side of the wall, whose distance from the keyframes that saw
     them is multiplied by side_factor. A larger one makes that side wider."""
-    side_factor: float = 1.3
+    side_factor: Annotated[float, Range(0.1, 10)] = 1.3
     """Factor, from 0.1 to 10, on the distance of the points that side_share names. A larger one puts them farther away;
     below 1 they come nearer."""
-    fold_share: float = 0.0
+    fold_share: Annotated[float, SHARE] = 0.0
     """Share, in [0, 1], of a submap's points, one patch of wall, that are put on the next fold, as if mistaken for it
     (see fold_shift). A larger one makes a larger patch."""
-    fold_shift: float = 0.6
+    fold_shift: Annotated[float, Range(-1000, 1000)] = 0.6
     """How far the patch of fold_share is moved ahead, as a share of the typical distance from a submap's keyframes to
     its points. A larger one moves it farther; below 0 it moves back."""
-    loop_share: float = 0.0
+    loop_share: Annotated[float, SHARE] = 0.0
     """Length, as a share of each submap's path in [0, 1], of a loop that is closed where there is none, between two
     places along it that are taken for neighbours (see loop_shift); 0 closes none. A larger one makes a longer loop."""
-    loop_shift: float = 0.5
+    loop_shift: Annotated[float, SHARE] = 0.5
     """How far the second of the two places of loop_share is moved towards the first, as a share in [0, 1] of the way
     between them; 1 makes them one. A larger one bends the map more."""
-    loop_at: float | None = None
+    loop_at: Annotated[float | None, SHARE] = None
     """Where the first of the two places of loop_share is, as a share in [0, 1] of where it can be; left out, it is
     drawn. A larger one closes the loop later on the path."""
-    pose_drift: float = 0.0
+    pose_drift: Annotated[float, at_least(0)] = 0.0
     """How far the last keyframe is from its true place, as a share of the path's length; the error grows along the
     path, from 0 at the first. A larger one bends the path more."""
-    pose_drift_deg: float = 0.0
+    pose_drift_deg: Annotated[float, at_least(0)] = 0.0
     """How far the last keyframe is turned from its true direction, degrees; the error grows along the path, from 0 at
     the first. A larger one turns the keyframes more."""
     points_follow: bool = False
     """Whether points move along with the keyframes that saw them when these drift (pose_drift, pose_drift_deg), as in a
     real SLAM; switched off, they stay where they are, and the poses contradict them."""
-
-    def __post_init__(self) -> None:
-        for name in ("drift", "side_factor"):
-            if not 0.1 <= getattr(self, name) <= 10:
-                raise InputError(name, f"{getattr(self, name)}", "expected a factor from 0.1 to 10")
-        for name in ("side_share", "fold_share", "loop_share", "loop_shift"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(name, f"{getattr(self, name)}", "expected a share from 0 to 1")
-        for name in ("pose_drift", "pose_drift_deg"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(name, f"{getattr(self, name)}", "expected 0 or more")
-        if self.loop_at is not None and not 0 <= self.loop_at <= 1:
-            raise InputError("loop_at", f"{self.loop_at}", "expected a share from 0 to 1")
-        if not np.isfinite(self.fold_shift):
-            raise InputError("fold_shift", f"{self.fold_shift}", "expected a finite number")
 
 
 @overload

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -15,19 +16,21 @@ from torch import Tensor
 from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole
 from lightdepth.datasets.c3vd import C3VD
 from lightdepth.errors import InputError
+from lightdepth.ranges import SHARE, Range, checked, ends_of
 from lightdepth.tube.shape import TubeShape
 
 Lens = Literal["pinhole", "telescope", "fisheye", "c3vd"]
 
 
 @dataclass(frozen=True)
+@checked
 class PathConfig:
     """How the endoscope moves; pairs are the ends of a uniform range."""
 
-    sway: float = 0.13
+    sway: Annotated[float, SHARE] = 0.13
     """Standard deviation of how far the path strays from the colon's centreline, in each of two directions, as a share
     of the radius; it is cut off at 2.3 times that. A larger one brings the camera nearer to the wall."""
-    turned: tuple[float, float] = (0.0, 0.0)
+    turned: Annotated[tuple[float, float], ends_of(Range(0, math.pi))] = (0.0, 0.0)
     """Ends of the range of the angle, radians, by which each view is turned from the way ahead, in a direction of its
     own; (0, 0) looks ahead. A larger one looks at walls more from the front, and makes neighbouring frames less
     alike."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ from torch import Tensor
 from lightdepth.camera import CameraModel
 from lightdepth.photometry import LightTerms, PhotometricCalibration, irradiance
 from lightdepth.radiosity import form_factors
+from lightdepth.ranges import SHARE, at_least, checked
 from lightdepth.tube.casting import Caster, EmbreeCaster, make_caster
 from lightdepth.tube.film import FilmConfig, cover, fine_relief
 from lightdepth.tube.path import PathConfig, image_flow
@@ -37,6 +39,7 @@ from lightdepth.tube.wall import WallMap, place_of
 
 
 @dataclass(frozen=True)
+@checked
 class TubeConfig:
     shape: ShapeConfig = field(default_factory=ShapeConfig)
     """Ranges of the shape of a colon (of two ends, a value between is drawn for each)."""
@@ -49,10 +52,10 @@ class TubeConfig:
     each)."""
     path: PathConfig = field(default_factory=PathConfig)
     """How the endoscope moves through the colon."""
-    patch: float = 3.5
+    patch: Annotated[float, at_least(0.2, up_to=1000)] = 3.5
     """Length along the tube, mm, of the patches of wall between which light is thrown to and fro. A larger one makes
     coarser indirect light, sooner."""
-    least_cosine: float = 0.0
+    least_cosine: Annotated[float, SHARE] = 0.0
     """Least cosine between the wall's normal, interpolated over its mesh, and the direction to the camera; normals
     turned farther away, at the edges of folds, are turned back to it. A larger one turns more of them; 0 leaves all as
     they are."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -18,80 +19,82 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from lightdepth.photometry import bent, encode
+from lightdepth.ranges import BELOW_ONE, SHARE, Range, at_least, checked, ends_of
 
 
 @dataclass(frozen=True)
+@checked
 class SensorConfig:
     """Light and camera of one endoscope; pairs are the ends of a uniform range. (0, 0) switches an effect off where
     nothing else is said; everything from cosine_exponent on is off."""
 
-    gamma: tuple[float, float] = (2.0, 2.6)
+    gamma: Annotated[tuple[float, float], ends_of(Range(0.1, 10))] = (2.0, 2.6)
     """Ends of the range of the exponent gamma of the camera's response: light v, in [0, 1], becomes the code
     v^(1/gamma). A larger one brightens dark parts more."""
-    mu: tuple[float, float] = (2.2, 3.4)
+    mu: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (2.2, 3.4)
     """Ends of the range of the exponent mu of the light's spread exp(-mu (1 - cos psi)), psi the angle from its axis.
     A larger one makes a narrower light."""
-    light_offset: float = 2.0
+    light_offset: Annotated[float, at_least(0, up_to=1000)] = 2.0
     """Root mean square of the distance by which the light sits beside the camera, mm, drawn for each endoscope. A
     larger one puts lamps farther from the camera."""
-    reflectance: tuple[float, float] = (0.0, 0.7)
+    reflectance: Annotated[tuple[float, float], ends_of(BELOW_ONE)] = (0.0, 0.7)
     """Ends of the range of the share of the light falling on it that the wall throws back on other wall. A larger one
     makes more indirect light."""
-    specular: tuple[float, float] = (0.0, 0.5)
+    specular: Annotated[tuple[float, float], ends_of(at_least(0))] = (0.0, 0.5)
     """Ends of the range of a factor on the strength of highlights (mirrored light of the lamp). A larger one makes
     brighter highlights; (0, 0) makes none."""
-    bright_share: tuple[float, float] = (0.03, 0.2)
+    bright_share: Annotated[tuple[float, float], ends_of(SHARE)] = (0.03, 0.2)
     """Ends of the range of the share of an image's pixels that auto exposure lets reach full brightness. A larger one
     makes brighter images."""
-    shoulder: tuple[float, float] = (0.75, 1.0)
+    shoulder: Annotated[tuple[float, float], ends_of(SHARE)] = (0.75, 1.0)
     """Ends of the range of the code value (brightness as stored), in [0, 1], from which the tone curve flattens towards
     white, drawn for each colon. A larger one flattens less of the curve; (1, 1) none of it."""
-    noise: tuple[float, float] = (0.003, 0.012)
+    noise: Annotated[tuple[float, float], ends_of(SHARE)] = (0.003, 0.012)
     """Ends of the range of the standard deviation of the noise that does not depend on the light, in code values
     (brightness as stored, in [0, 1]). A larger one makes noisier images."""
-    exposure: tuple[float, float] = (0.1, 0.1)
+    exposure: Annotated[tuple[float, float], ends_of(at_least(0, up_to=10))] = (0.1, 0.1)
     """Ends of the range of the standard deviation of the log of the exposure from frame to frame (0.1 is about 10 %). A
     larger one makes brightness jump more."""
-    cosine_exponent: tuple[float, float] = (1.0, 1.0)
+    cosine_exponent: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (1.0, 1.0)
     """Ends of the range of the exponent on the cosine between the wall's normal and the direction to the lamp: 1 is
     matt (Lambert), rough walls have less, satin ones more. A larger one makes slanted wall darker."""
-    gloss: tuple[float, float] = (60.0, 60.0)
+    gloss: Annotated[tuple[float, float], ends_of(at_least(0))] = (60.0, 60.0)
     """Ends of the range of the exponent of the lobe of highlights (as in Phong's model). A larger one makes smaller,
     sharper highlights."""
-    roughness: tuple[float, float] = (0.1, 0.1)
+    roughness: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (0.1, 0.1)
     """Ends of the range of the slope, a ratio of height to length, of bumps about a millimetre wide that break up
     highlights. A larger one scatters highlights more."""
-    sparkle: tuple[float, float] = (0.0, 0.0)
+    sparkle: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (0.0, 0.0)
     """Ends of the range of the slope, a ratio of height to length, of relief tenths of a millimetre wide. A larger one
     breaks highlights into more sparks; (0, 0) has no such relief."""
-    vignetting: tuple[float, float] = (0.0, 0.0)
+    vignetting: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (0.0, 0.0)
     """Ends of the range of the exponent k of the lens's darkening to the side, cos^k of the angle from its axis; (0, 0)
     is none. A larger one makes darker corners."""
-    glare: tuple[float, float] = (0.0, 0.0)
+    glare: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of the share of the light that the lens spreads over the rest of the image. A larger one veils
     dark parts more; (0, 0) makes none."""
-    bloom: tuple[float, float] = (0.0, 0.0)
+    bloom: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of the share of the light above white that spills over to the pixels around. A larger one makes
     brighter halos around saturated spots; (0, 0) makes none."""
-    motion: tuple[float, float] = (0.0, 0.0)
+    motion: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of the length of motion blur (median over an image's pixels, on average over images), as a
     share of the image height. A larger one blurs more; (0, 0) makes none."""
-    defocus: tuple[float, float] = (0.0, 0.0)
+    defocus: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of the sigma (radius) of the blur out of focus, as a share of the image height. A larger one
     blurs more; (0, 0) makes none."""
-    cast: tuple[float, float] = (0.0, 0.0)
+    cast: Annotated[tuple[float, float], ends_of(at_least(0, up_to=10))] = (0.0, 0.0)
     """Ends of the range of the standard deviation of the log of each colour channel's gain (0.06 is about 6 %). A
     larger one makes stronger colour casts; (0, 0) makes none."""
-    contrast: tuple[float, float] = (0.0, 0.0)
+    contrast: Annotated[tuple[float, float], ends_of(Range(-1, 1))] = (0.0, 0.0)
     """Ends of the range of a factor, from -1 to 1, on an S-shaped bend of the tone curve; 0 leaves it, below 0 flattens
     it. A larger one makes more contrast."""
-    shot_noise: tuple[float, float] = (0.0, 0.0)
+    shot_noise: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of the standard deviation, at white, of the noise that grows with the root of the light, as a
     share of white. A larger one makes noisier images; (0, 0) makes none."""
-    sharpen: tuple[float, float] = (0.0, 0.0)
+    sharpen: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (0.0, 0.0)
     """Ends of the range of the weight with which the processor adds fine detail back (unsharp masking); (0, 0) is none.
     A larger one makes harder edges."""
-    jpeg: tuple[int, int] = (100, 100)
+    jpeg: Annotated[tuple[int, int], ends_of(Range(0, 100))] = (100, 100)
     """Ends of the range of the JPEG quality, a number from 0 to 100, with colour at half resolution; at 100 images are
     not compressed. A higher one leaves fewer artefacts."""
 

@@ -6,56 +6,60 @@ spokes (columns, along phi; the last column continues at the first). Lengths in 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from lightdepth.ranges import SHARE, Range, above, at_least, checked, ends_of
 from lightdepth.tube.polyps import Polyp, draw_polyps, raised
 
 
 @dataclass(frozen=True)
+@checked
 class ShapeConfig:
     """What a colon may look like; pairs are the ends of a uniform range. Lengths in mm."""
 
-    length: float = 150.0
+    length: Annotated[float, above(0, up_to=10_000)] = 150.0
     """Length of the colon along its centreline, mm. A longer one holds longer paths and takes longer to make."""
-    radius: tuple[float, float] = (15.0, 25.0)
+    radius: Annotated[tuple[float, float], ends_of(above(0, up_to=1000))] = (15.0, 25.0)
     """Ends of the range of the mean radius, mm. A larger one makes a wider colon."""
-    bend: tuple[float, float] = (0.0, 0.9)
+    bend: Annotated[tuple[float, float], ends_of(Range(0, math.pi))] = (0.0, 0.9)
     """Ends of the range of how far the tube's direction may turn to either side along its length, radians. A larger one
     makes a more winding colon."""
-    fold_spacing: tuple[float, float] = (11.0, 24.0)
+    fold_spacing: Annotated[tuple[float, float], ends_of(above(0, up_to=10_000))] = (11.0, 24.0)
     """Ends of the range of the distance from one fold to the next, mm, drawn from fold to fold. A larger one makes
     fewer folds."""
-    fold_depth: tuple[float, float] = (0.12, 0.38)
+    fold_depth: Annotated[tuple[float, float], ends_of(SHARE)] = (0.12, 0.38)
     """Ends of the range of how far a fold reaches into the lumen, as a share of the radius; each fold draws its own. A
     larger one hides more wall behind folds."""
-    fold_width: tuple[float, float] = (1.6, 3.2)
+    fold_width: Annotated[tuple[float, float], ends_of(above(0, up_to=1000))] = (1.6, 3.2)
     """Ends of the range of a fold's half width along the tube, mm; each fold draws its own. A larger one makes blunter
     folds."""
-    bump: tuple[float, float] = (0.01, 0.05)
+    bump: Annotated[tuple[float, float], ends_of(SHARE)] = (0.01, 0.05)
     """Ends of the range of the deviation of the wall from a smooth tube between the folds, as a share of the radius. A
     larger one makes a less even wall."""
-    step: float = 0.8
+    step: Annotated[float, at_least(0.05, up_to=100)] = 0.8
     """Distance between neighbouring points of the mesh that the wall is made of, mm. A larger one makes a coarser wall,
     sooner."""
-    crescent: tuple[float, float] = (0.0, 0.0)
+    crescent: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of how unlike the three parts of a fold are, a share in [0, 1]: at 0 alike, at 1 each is
     anything from missing to a third deeper. A larger one makes less regular folds."""
-    waviness: tuple[float, float] = (0.0, 0.0)
+    waviness: Annotated[tuple[float, float], ends_of(at_least(0, up_to=1000))] = (0.0, 0.0)
     """Ends of the range of how far a fold's line around the tube strays from a plane, mm. A larger one makes wavier
     folds."""
-    taeniae: tuple[float, float] = (0.0, 0.0)
+    taeniae: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of how far three bands along the tube (taeniae) pull the wall inwards, as a share of the
     radius. A larger one makes a more triangular lumen."""
-    polyps: tuple[int, int] = (0, 0)
+    polyps: Annotated[tuple[int, int], ends_of(at_least(0, up_to=10_000))] = (0, 0)
     """Least and largest number of polyps in a colon, between which it is drawn. More polyps leave fewer images without
     one."""
-    polyp_radius: tuple[float, float] = (1.5, 5.0)
+    polyp_radius: Annotated[tuple[float, float], ends_of(above(0, up_to=1000))] = (1.5, 5.0)
     """Ends of the range of the radius of a polyp's head, mm. A larger one makes larger polyps, but never so large that
     the endoscope cannot pass."""
-    stalked: float = 0.35
+    stalked: Annotated[float, SHARE] = 0.35
     """Share of polyps, in [0, 1], that stand on a stalk; the others are flat domes. A larger one makes more stalks."""
 
 

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
+from lightdepth.ranges import BELOW_ONE, COUNT, SHARE, above, at_least, checked
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 from lightdepth.tube.breathing import Breathing
 from lightdepth.tube.map_errors import scale_drift
@@ -28,45 +29,46 @@ Kind = Literal["tracked", "independent"]
 
 
 @dataclass(frozen=True)
+@checked
 class SlamConfig:
     """How good the simulated SLAM is; what is left out depends on its kind."""
 
     kind: Kind = "tracked"
     """Which SLAM is simulated: tracked errs as a real one does (short tracks, errors that neighbouring points share),
     independent is a stress test with many points, each wrong on its own."""
-    keyframe_every: int | None = None
+    keyframe_every: Annotated[int | None, COUNT] = None
     """Number of frames from one keyframe to the next; left out, drawn from 10 to 20 each time (tracked), or 2
     (independent). More make fewer keyframes."""
-    maps: int = 2
+    maps: Annotated[int, at_least(1, up_to=10_000)] = 2
     """Number of submaps, each a stretch of the path with a scale and origin of its own. More make shorter submaps."""
-    shared_keyframes: int = 2
+    shared_keyframes: Annotated[int, at_least(0, up_to=10_000)] = 2
     """Number of keyframes at its beginning that a submap has in common with the one before it. More make submaps easier
     to join."""
-    points_per_keyframe: int | None = None
+    points_per_keyframe: Annotated[int | None, COUNT] = None
     """Largest number of points that each keyframe observes (tracked; left out, 250 to 1500, drawn for each submap) or
     adds to those before (independent; left out, 250). More make a denser map."""
-    spurious: float | None = None
+    spurious: Annotated[float | None, BELOW_ONE] = None
     """Share of the map points, in [0, 1), that are wrong: at least 1.3 times too far, or with tracked also too near;
     left out, 0.03 (tracked) or 0.3 (independent). A larger one makes the map harder to densify."""
-    point_noise: float | None = None
+    point_noise: Annotated[float | None, at_least(0, up_to=10)] = None
     """Error of the other points' distance, as a share of it: the median size (tracked; left out, 0.035), or the
     standard deviation at 20 mm, in proportion more farther off (independent; left out, 0.01). A larger one makes a
     noisier map."""
-    shared_noise: float = 0.3
+    shared_noise: Annotated[float, SHARE] = 0.3
     """Share, in [0, 1], of the variance of point_noise that neighbouring points have in common; only with tracked. A
     larger one makes whole pieces of wall wrong together."""
-    shared_length_mm: float = 6.0
+    shared_length_mm: Annotated[float, above(0)] = 6.0
     """Distance, mm, at which the error that points have in common (shared_noise) is still correlated by 0.6; only with
     tracked. A larger one makes larger pieces of wall wrong together."""
-    drift: float | None = None
+    drift: Annotated[float | None, at_least(0, up_to=10)] = None
     """Change of a submap's scale from one end of its path to the other, as a share, at random growing or shrinking;
     left out, 0.04 (tracked) or 0 (independent). A larger one makes the two ends more unlike in size."""
-    pixel_noise: float = 0.5
+    pixel_noise: Annotated[float, at_least(0)] = 0.5
     """Standard deviation of the error of where a point is observed in the image, along each axis, pixels. A larger one
     makes noisier observations."""
-    pose_noise_mm: float = 0.05
+    pose_noise_mm: Annotated[float, at_least(0)] = 0.05
     """Standard deviation of the error of a keyframe's place, along each axis, mm. A larger one makes noisier poses."""
-    pose_noise_deg: float = 0.05
+    pose_noise_deg: Annotated[float, at_least(0)] = 0.05
     """Standard deviation of the error of a keyframe's rotation, about each axis, degrees. A larger one makes noisier
     poses."""
 

@@ -3,45 +3,48 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from lightdepth.ranges import SHARE, Range, above, at_least, checked, ends_of
 from lightdepth.tube.shape import smooth_noise
 
 
 @dataclass(frozen=True)
+@checked
 class TextureConfig:
     """Ranges of the wall's appearance."""
 
-    hue: tuple[float, float] = (-0.03, 0.06)
+    hue: Annotated[tuple[float, float], ends_of(Range(-1, 1))] = (-0.03, 0.06)
     """Ends of the range of the wall's hue, turns of the colour circle: 0 is red, 0.08 orange, below 0 a bluish red. A
     larger one is more orange."""
-    saturation: tuple[float, float] = (0.3, 0.65)
+    saturation: Annotated[tuple[float, float], ends_of(SHARE)] = (0.3, 0.65)
     """Ends of the range of the wall's saturation, a share in [0, 1]. A larger one makes deeper colours."""
-    mottling: tuple[float, float] = (0.02, 0.08)
+    mottling: Annotated[tuple[float, float], ends_of(SHARE)] = (0.02, 0.08)
     """Ends of the range of the standard deviation of saturation from place to place, saturation being a share in [0,
     1]. A larger one makes a more mottled wall."""
-    value: tuple[float, float] = (0.0, 0.12)
+    value: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.12)
     """Ends of the range of how much darker the darkest spots of the wall are than the brightest, a share of brightness;
     depth from light assumes 0. A larger one breaks that assumption more."""
-    vessels: tuple[int, int] = (10, 45)
+    vessels: Annotated[tuple[int, int], ends_of(at_least(0, up_to=10_000))] = (10, 45)
     """Least and largest number of stems of blood vessels, each of which branches. More give the wall more texture."""
-    resolution: float = 0.14
+    resolution: Annotated[float, at_least(0.02, up_to=100)] = 0.14
     """Size of a texel, the pixel of the wall's paint, mm. A larger one makes coarser paint, sooner."""
-    vessel_width: tuple[float, float] = (0.25, 0.7)
+    vessel_width: Annotated[tuple[float, float], ends_of(above(0, up_to=1000))] = (0.25, 0.7)
     """Ends of the range of the width of a vessel's stem, mm. A larger one makes thicker vessels."""
-    vessel_value: tuple[float, float] = (0.0, 0.0)
+    vessel_value: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of how much darker vessels are than the wall, a share of brightness, on top of up to 25 % where
     scene.texture.value is above 0. A larger one makes darker vessels."""
-    vessel_strength: tuple[float, float] = (1.0, 1.0)
+    vessel_strength: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (1.0, 1.0)
     """Ends of the range of a factor on how strongly vessels are painted, in colour and darkness; 0 hides them. A larger
     one makes them plainer."""
-    blotches: tuple[float, float] = (0.0, 0.0)
+    blotches: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of how much more saturated inflamed patches are than the wall, a share. A larger one makes
     redder patches; (0, 0) makes none."""
-    speckle: tuple[float, float] = (0.0, 0.0)
+    speckle: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of the standard deviation of saturation, a share, between grains about 0.3 mm wide, as mucosal
     pits are. A larger one makes a grainier wall; (0, 0) makes none."""
 

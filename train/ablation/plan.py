@@ -12,9 +12,11 @@ from typing import Any
 import yaml
 from jsonargparse import ArgumentParser, Namespace
 
+from lightdepth.command_line.gone_settings import without_given
 from lightdepth.command_line.presets import shipped
 from lightdepth.command_line.settings_yaml import read_settings
 from lightdepth.errors import InputError
+from lightdepth.regular import regular
 from lightdepth.reporting.run import plain
 
 from ..colons import TubeData, colon_seeds
@@ -95,13 +97,14 @@ def plans_of(
             if isinstance(defaults.get(dotted), Namespace) and not isinstance(value, dict):
                 raise InputError(where, f"{dotted} is a group of options", f"give one of them, as {dotted}.NAME")
             _set(values, dotted, value, where)
+        without_given(values)
         for seed in row.seeds or seeds:
             folder = output / f"seed_{seed}" / row.file
             try:
                 config = parser.parse_object({**values, "seed": seed, "output": str(folder)})
                 if seed == (row.seeds or seeds)[0]:
                     parser.instantiate(config)
-            except ArgumentError as error:
+            except (ArgumentError, ImportError) as error:  # the second is of a class that settings name
                 reason = " ".join(str(error).split())
                 raise InputError(where, reason, "expected options of `lightdepth train`") from error
             except InputError as error:
@@ -113,6 +116,7 @@ def plans_of(
 
 
 def _read(path: Path) -> dict[str, Any]:
+    regular(path, "expected a YAML like configs/train/*.yaml")
     try:
         values = read_settings(path)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

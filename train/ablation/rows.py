@@ -5,15 +5,17 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Literal
 
-from lightdepth.errors import InputError
+from lightdepth.ranges import COUNT, SEED, checked
 
-Settings = dict[str, Any]
+_Plain = bool | int | float | str | None
+Settings = dict[str, _Plain | list[_Plain | list[_Plain]] | dict[str, _Plain | list[_Plain]]]
 """Dotted options of `train` and their values, as a YAML gives them; the parser of `train` checks them."""
 
 
 @dataclass(frozen=True)
+@checked
 class Row:
     """One training."""
 
@@ -32,7 +34,7 @@ class Row:
     """What a network that has the wall's reflectance as an input is told of it when it is judged: the "true" value, a
     "wrong" one (0.3 more), or one "estimated" per colon without truth (least loss). Each makes one line of the
     table."""
-    seeds: tuple[int, ...] | None = None
+    seeds: Annotated[tuple[int, ...] | None, SEED] = None
     """Seeds of the row's own trainings, numbers; left out, those of the ablation. More make the row more certain and
     take longer."""
     curve: bool = False
@@ -44,6 +46,7 @@ class Row:
 
 
 @dataclass(frozen=True)
+@checked
 class JudgedColons:
     """Colons to judge on, with the lenses and the light's ranges of the training colons."""
 
@@ -54,20 +57,12 @@ class JudgedColons:
     (lightdepth.tube.variant)."""
     strength: Literal["weak", "strong"]
     """Strength of the light from wall to wall: weak or strong."""
-    first: int
+    first: Annotated[int, SEED]
     """Number that seeds the first colon; the others count on from it. Another one draws other colons."""
-    count: int
+    count: Annotated[int, COUNT]
     """Number of colons to judge on. More judge more surely and take longer."""
-    frames: int = 2
+    frames: Annotated[int, COUNT] = 2
     """Number of frames of each colon. More judge more surely and take longer."""
-
-    def __post_init__(self) -> None:
-        if min(self.count, self.frames) < 1 or self.first < 0:
-            raise InputError(
-                f"judged colons {self.name!r}",
-                f"count {self.count}, frames {self.frames}, first {self.first}",
-                "expected count and frames above 0 and first of at least 0",
-            )
 
     @property
     def seeds(self) -> range:

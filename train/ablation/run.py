@@ -33,11 +33,9 @@ def finished(plan: Plan) -> Result | None:
     """The result in the row's file, where it was made with these settings."""
     try:
         found = json.loads(plan.path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError):
+        return Result(**found["result"]) if found["stamp"] == plan.stamp else None
+    except (OSError, ValueError, TypeError, KeyError, IndexError, RecursionError):  # it is made again
         return None
-    if not isinstance(found, dict) or found.get("stamp") != plan.stamp:
-        return None
-    return Result(**found["result"])
 
 
 def train_all(parser: ArgumentParser, todo: Sequence[Plan], judge: Judge) -> None:

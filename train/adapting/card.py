@@ -7,14 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 from lightdepth.errors import InputError
 from lightdepth.losses import LossConfig
+from lightdepth.tube.path import Lens
 
 from ..card import Card
 from ..colons import TubeData
 from .judging import Verdict
+
+_MAX_FRAMES, _MAX_TRAVEL_MM = 1000, 10_000.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +90,27 @@ def source_colons(card: dict[str, Any], scenes: int) -> TubeData:
     known: dict[str, Any] = {
         name: tuple(own[name]) if isinstance(own[name], list) else own[name]
         for name in ("frames", "travel", "lenses", "mu", "gamma", "reflectance", "family")
-        if name in own
+        if isinstance(own, dict) and name in own
     }
+    wrong = [name for name, value in known.items() if not _drawable(name, value)]
+    if wrong or not isinstance(own, dict):
+        raise InputError(
+            "the checkpoint's card",
+            f"it was trained on colons of a kind that is not known here ({', '.join(wrong) or 'tube'})",
+            "--replay 0 does without them",
+        )
     return TubeData(scenes=scenes, **known)
+
+
+def _drawable(name: str, value: object) -> bool:
+    """Whether colons can be drawn from what a card says of them: a stranger's may say anything."""
+    if name == "frames":
+        return isinstance(value, int) and 1 <= value <= _MAX_FRAMES
+    if name == "travel":
+        return isinstance(value, int | float) and 0 <= value <= _MAX_TRAVEL_MM
+    if name == "family":
+        return value in ("plain", "realistic", "mixed")
+    if name == "lenses":
+        return isinstance(value, tuple) and 0 < len(value) <= 100 and all(one in get_args(Lens) for one in value)
+    numbers = value if isinstance(value, tuple) and len(value) == 2 else ()
+    return bool(numbers) and all(isinstance(v, int | float) and 0 <= v <= 100 for v in numbers)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from lightdepth.errors import InputError
+from lightdepth.ranges import BETWEEN, SEED, above, at_least, checked
 
 from .module import What
 
@@ -16,65 +16,53 @@ POINTS = 100.0
 
 
 @dataclass(frozen=True)
+@checked
 class AdaptConfig:
     """What of the network learns, from what, and for how long."""
 
-    steps: int = 300
+    steps: Annotated[int, at_least(1)] = 300
     """Number of training steps. More move the network further from the checkpoint, for better or worse, and take
     longer."""
-    learning_rate: float = 5e-4
+    learning_rate: Annotated[float, above(0, up_to=1)] = 5e-4
     """Highest learning rate, above 0, which training climbs to and then falls from. A larger one changes the weights
     more in every step: the network learns faster, and less steadily."""
-    batch_size: int = 4
+    batch_size: Annotated[int, at_least(1, up_to=100_000)] = 4
     """Number of frames in a batch, from which each step learns. More make steadier steps and take more time and
     memory."""
-    size: tuple[int, int] | None = None
+    size: Annotated[tuple[int, int] | None, at_least(16, up_to=10_000)] = None
     """Width and height that images are resized to for training, pixels; left out, the height that the checkpoint was
     trained at, and the width that goes with it. A larger one shows finer detail and takes longer."""
     what: What = "all"
     """Which weights learn: all (but those of the uncertainty head); decoder, all behind the part that reads the image;
     norms, only scale and shift of the normalisations; low_rank, a small addition to each layer (see --rank). The fewer
     learn, the less can change."""
-    rank: int = 4
+    rank: Annotated[int, at_least(1, up_to=10_000)] = 4
     """Number of ranks (independent directions) of what --what low_rank adds to each layer; without that it has no
     effect. More let the network change further."""
-    anchor: float | None = None
+    anchor: Annotated[float | None, at_least(0)] = None
     """Weight that holds the shape of each distance map to what the checkpoint gave before; 0 lets go. Left out, half of
     --points where a map teaches and something judges; else 0 where true distance judges, and 20 where it does not. A
     larger one holds it more firmly."""
-    replay: int = 0
+    replay: Annotated[int, at_least(0, up_to=1_000_000)] = 0
     """Number of synthetic colons of the kind that the checkpoint was trained on, whose frames fill half of each batch,
     so that what it knew is not lost; 0 for none. More show more variety and take longer to render."""
-    points: float | None = None
+    points: Annotated[float | None, at_least(0)] = None
     """Weight of the map's points as teachers of distance (up to one factor per image); left out, 100 where there is a
     map; 0, they teach nothing. Points that a held-out frame saw, and a fifth of the others in whole blocks of wall,
     only judge. A larger one follows the points more closely."""
-    overlap: float = 0.0
+    overlap: Annotated[float, at_least(0)] = 0.0
     """Weight of the term that makes the distances of two of the map's keyframes agree where both see the same wall; 0
     leaves it out. A larger one makes them agree better. Above 0 it needs a map, given or made."""
     judge: Literal["auto", "none"] = "auto"
     """What tells whether the adapted network is better: auto takes true distance where the frames have it, else the map
     of --map, else one that is made of the frames. none does the same but makes no map, so that without truth and --map
     nothing judges."""
-    held_out: float = 0.2
+    held_out: Annotated[float, BETWEEN] = 0.2
     """Share of each sequence, above 0 and below 1, at its end, that judges and is never trained on. A larger one judges
     more surely and trains on less."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Number that all chance follows from: order of frames, augmentation, replayed colons, blocks of wall that judge,
     the beginning of low_rank. Another one makes another run, better or worse by chance alone."""
-
-    def __post_init__(self) -> None:
-        if min(self.steps, self.batch_size) < 1 or not self.learning_rate > 0 or self.replay < 0:
-            raise InputError(
-                "--steps",
-                f"{self.steps}, --batch-size {self.batch_size}, --learning-rate {self.learning_rate}, --replay "
-                f"{self.replay}",
-                "expected positive numbers, and 0 or more colons",
-            )
-        if not ((self.points is None or self.points >= 0) and self.overlap >= 0):
-            raise InputError("--points", f"{self.points}, --overlap {self.overlap}", "expected weights of 0 or more")
-        if not 0 < self.held_out < 1:
-            raise InputError("--held-out", f"{self.held_out}", "expected a share above 0 and below 1")
 
     def taught_by(self, has_map: bool) -> float:
         """The weight of a map's points, by whether there is a map."""

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.coloured import colours_of
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.errors import InputError
+from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import Content, write_together
 from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
+from lightdepth.ranges import Range, checked
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.report import Report
@@ -45,6 +47,7 @@ _SHOWN = 48  # pictures of kept and of rejected frames each
 
 
 @dataclass(frozen=True)
+@checked
 class SelectConfig:
     """What is covisible and what is kept, by each way of telling."""
 
@@ -56,7 +59,7 @@ class SelectConfig:
     """weights and thresholds of the loftr matcher"""
     loftr_nodes: NodeRules = LOFTR_NODES
     """what is covisible and what is kept, with the loftr matcher"""
-    bit_depth: int | None = None
+    bit_depth: Annotated[int | None, Range(8, 32)] = None
     """Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what their
     highest values show. A larger one reads the same numbers as darker."""
     map_rules: MapRules = field(default_factory=MapRules)
@@ -99,7 +102,11 @@ def select(
             frames.
         overwrite: Replace the files of an earlier run. Without it, files that are already there are refused.
     """
-    paths = _paths(output, no_frames, overwrite)
+    paths = _paths(output)
+    check_files(paths.values(), overwrite, [data, map, camera, mask])
+    if output.resolve().parent == data.resolve() and not no_frames and any(c.isdigit() for c in output.stem):
+        found = f"{paths['sheet'].name}, among the frames, would be taken for one: it has a number"
+        raise InputError("-o", found, "choose a name without digits, another folder, or --no-frames")
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=config.bit_depth)
     sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, reading)
     frames = frames.without_truth()
@@ -145,7 +152,7 @@ def select(
     print(f"{summary}\n{', '.join(str(path) for path in writers)}")
 
 
-def _paths(output: Path, no_frames: bool, overwrite: bool) -> dict[str, Path]:
+def _paths(output: Path) -> dict[str, Path]:
     if output.is_dir() or output.suffix in (".csv", ".html", ".png"):
         raise InputError(
             "-o",
@@ -156,9 +163,6 @@ def _paths(output: Path, no_frames: bool, overwrite: bool) -> dict[str, Path]:
     paths = {"list": output}
     for what, ending in (("table", ".csv"), ("sheet", "_contact.png"), ("page", ".html")):
         paths[what] = beside.with_name(beside.name + ending)
-    there = [path for path in paths.values() if path.exists()]
-    if there and not overwrite:
-        raise InputError(there[0], "already there", "choose another -o, or give --overwrite")
     return paths
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -35,7 +36,7 @@ def train(argv: list[str] | None = None) -> int:
     made = parser.instantiate(config)
     text = as_yaml(parser, config)
     flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given, "settings": made.fit}
-    fit(made.model, FrameDataModule(made.data), output, vars(made.trainer), text, config.seed, **flags)
+    fit(made.model, FrameDataModule(made.data), output, asdict(made.trainer), text, config.seed, **flags)
     return 0
 
 

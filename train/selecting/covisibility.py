@@ -14,12 +14,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, frame_number
+from lightdepth.ranges import SHARE, Range, at_least, checked
 from lightdepth.sparse_map import SparseMap, Submap, covisibility
 
 from .matching import Descriptor, MatchAgreement, Matcher
@@ -30,47 +31,42 @@ NOT_IN_MAP, FEW_KEYFRAMES = "not in the map", "too few covisible keyframes"
 
 
 @dataclass(frozen=True)
+@checked
 class NodeRules:
     """When a frame belongs to a node, and which nodes are kept."""
 
-    similarity: float = 0.98
+    similarity: Annotated[float, Range(-1, 1)] = 0.98
     """Likeness of two frames, a cosine up to 1 (the same), above which a frame joins the present node without being
     matched (a node is a run of frames that see the same wall). A higher one matches more frames and takes longer."""
-    min_matches: int = 15
+    min_matches: Annotated[int, at_least(0)] = 15
     """Number of matches above which two frames count as covisible, that is as seeing the same wall. More keep fewer
     frames."""
-    min_spread: float = 0.2
+    min_spread: Annotated[float, SHARE] = 0.2
     """Least share of the image (of the cells of an 8 x 8 grid) in which the matches of two covisible frames must lie; 0
     asks for none. A larger one keeps fewer frames."""
-    min_views: int = 3
+    min_views: Annotated[int, at_least(1)] = 3
     """Least number of views that a node must have for its frames to be kept (a node is a run of frames that see the
     same wall; its views are those that further frames are matched with). More keep fewer frames."""
-    max_skipped: int = 1
+    max_skipped: Annotated[int, at_least(0)] = 1
     """Largest number of frames in a row that are taken for the same wall by `similarity` alone, without being matched;
     0 matches every frame. More take less time and notice changes later."""
-    min_frames: int = 1
+    min_frames: Annotated[int, at_least(1)] = 1
     """Least number of frames from one view of a node to the next (a node is a run of frames that see the same wall; its
     views are those that further frames are matched with). More make fewer views, so that fewer nodes reach
     min_views."""
-    max_views: int = 29
+    max_views: Annotated[int, at_least(1)] = 29
     """Number of views above which a node ends and the next frame begins another (a node is a run of frames that see the
     same wall; its views are those that further frames are matched with). More make longer nodes."""
     reference: Literal["last", "middle"] = "last"
     """Which view of a node a new frame is matched with (a node is a run of frames that see the same wall): last, the
     newest, so that a node may move along the wall; middle, an older one, so that a node ends sooner as the camera moves
     on."""
-    blur: float = 0.5
+    blur: Annotated[float, at_least(0)] = 0.5
     """Share of the median number of features of the kept frames, below which a frame is rejected as blurred, even where
     it matches others; 0 rejects none. A larger one rejects more frames. With the loftr matcher, which has no features
     to count, it has no effect."""
 
     def __post_init__(self) -> None:
-        if min(self.min_views, self.min_frames, self.max_views) < 1 or min(self.min_matches, self.max_skipped) < 0:
-            raise InputError(
-                "the rules of covisibility",
-                f"{self}",
-                "expected min_views, min_frames and max_views of at least 1, and nothing below 0",
-            )
         if self.max_views < self.min_views - 1:
             raise InputError(
                 "max_views",
@@ -230,27 +226,22 @@ def _verdict(seen: _Seen, blurred: bool, views_in: Counter[int], good: set[int])
 
 
 @dataclass(frozen=True)
+@checked
 class MapRules:
     """Which frames a sparse map vouches for."""
 
-    points: int = 15
+    points: Annotated[int, at_least(1)] = 15
     """Number of map points that two keyframes must both see to count as covisible (seeing the same wall). More keep
     fewer frames."""
-    keyframes: int = 2
+    keyframes: Annotated[int, at_least(1)] = 2
     """Least number of other keyframes that a keyframe must be covisible with (see the same wall as) to be kept. More
     keep fewer frames."""
-    between: int = 40
+    between: Annotated[int, at_least(1)] = 40
     """Largest difference of the numbers (in file names) of two kept keyframes that follow each other and are covisible,
     for the frames between them to be kept as well; 1 keeps keyframes only. More keep more frames."""
     published: bool = True
     """true: where camerasModel.txt (EndoMapper) lies beside the map, it says which keyframes are covisible, and
     --map-rules.points is not asked. false: the points always say it."""
-
-    def __post_init__(self) -> None:
-        if min(self.points, self.keyframes, self.between) < 1:
-            raise InputError(
-                "the rules of covisibility", f"{self}", "expected points, keyframes and between of at least 1"
-            )
 
 
 def select_by_map(

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
 
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
+from lightdepth.files.weights import check_header, read_pickled
 from lightdepth.frame import Frame, resized_mask
+from lightdepth.ranges import COUNT, SHARE, above, at_least, checked
 
 _CELLS = 8
 
@@ -45,30 +47,31 @@ class Matcher(Protocol):
 
 
 @dataclass(frozen=True)
+@checked
 class SiftSettings:
     """Features and their geometry."""
 
-    width: int = 480
+    width: Annotated[int, at_least(16, up_to=10_000)] = 480
     """Width that images are reduced to for matching, pixels; smaller ones stay as they are. A larger one finds finer
     features and takes longer."""
-    features: int = 800
+    features: Annotated[int, COUNT] = 800
     """Largest number of features taken of a frame, the strongest ones. More find more matches and take longer."""
-    contrast: float = 0.02
+    contrast: Annotated[float, at_least(0)] = 0.02
     """Least contrast of a feature, with brightness in [0, 1] (OpenCV's contrastThreshold). A higher one finds fewer,
     more distinct features."""
-    largest: float = 0.02
+    largest: Annotated[float, above(0)] = 0.02
     """Largest size of a feature, as a share of the image's width: larger ones survive blur, and would let blurred
     frames pass. A larger one takes in more features."""
-    ratio: float = 0.8
+    ratio: Annotated[float, above(0, up_to=1)] = 0.8
     """Largest ratio, up to 1, of the difference between a feature and its best match to that between it and its second
     best, for the match to count. A larger one takes in more matches, wrong ones among them."""
-    angle: float = 0.5
+    angle: Annotated[float, at_least(0, up_to=180)] = 0.5
     """Largest angle, degrees, by which a match may miss the plane in which the camera's motion lets it lie (its
     epipolar plane). A larger one takes in more matches, wrong ones among them."""
-    highlight: float = 0.95
+    highlight: Annotated[float, SHARE] = 0.95
     """Brightness, in [0, 1], above which red, green and blue must all be for a pixel to be a highlight, where no
     feature is taken. A higher one takes fewer pixels for highlights."""
-    border: float = 0.01
+    border: Annotated[float, at_least(0, below=0.5)] = 0.01
     """Width of the strip inside the border of the visible image and around highlights where no feature is taken, as a
     share of the image's width. A larger one leaves out more of the image."""
 
@@ -170,16 +173,17 @@ class OrientationDescriptor:
 
 
 @dataclass(frozen=True)
+@checked
 class LoftrSettings:
     """LoFTR as ColonMapper runs it: grey, half size, masked."""
 
     weights: Path | None = None
     """File with LoFTR's weights (.ckpt, .pth or .safetensors), such as kornia's loftr_outdoor.ckpt; --matcher loftr
     needs it, and nothing is downloaded."""
-    width: int = 720
+    width: Annotated[int, at_least(16, up_to=10_000)] = 720
     """Width that images are reduced to for matching, pixels; smaller ones stay as they are. A larger one finds finer
     matches and takes longer."""
-    confidence: float = 0.4
+    confidence: Annotated[float, SHARE] = 0.4
     """Least confidence of a match that counts, a share in [0, 1], as LoFTR gives it. A higher one takes in fewer, surer
     matches."""
     device: str = "cpu"
@@ -237,9 +241,6 @@ class LoftrMatcher:
 
 def read_loftr(settings: LoftrSettings) -> Any:
     """kornia's LoFTR with the weights of a local file. Raises InputError when there is none, or it is not LoFTR's."""
-    import pickle
-
-    import torch
     from kornia.feature import LoFTR
 
     path = settings.weights
@@ -254,14 +255,17 @@ def read_loftr(settings: LoftrSettings) -> Any:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
+            check_header(path, "use kornia's loftr_outdoor.ckpt")
             state: Any = load_file(path)
         else:
-            state = torch.load(path, map_location="cpu", weights_only=True)
+            state = read_pickled(path, "use kornia's loftr_outdoor.ckpt")
         state = state.get("state_dict", state)
         state = {name.removeprefix("matcher."): value for name, value in state.items()}
         network = LoFTR(pretrained=None)
         network.load_state_dict(state)
-    except (RuntimeError, OSError, ValueError, LookupError, EOFError, AttributeError, pickle.UnpicklingError) as error:
+    except InputError:
+        raise
+    except (RuntimeError, OSError, ValueError, LookupError, AttributeError) as error:
         raise InputError(
             path, f"not LoFTR's weights ({str(error).splitlines()[0][:200]})", "expected kornia's loftr_outdoor.ckpt"
         ) from error
