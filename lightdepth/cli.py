@@ -12,6 +12,7 @@ import inspect
 import io
 import os
 import sys
+from contextlib import suppress
 from functools import partial
 from importlib import metadata, util
 from pathlib import Path
@@ -25,8 +26,16 @@ if TYPE_CHECKING:
 from lightdepth import __version__
 from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.command_line.pipes import outliving_readers
+from lightdepth.command_line.signals import ending_on_signals
 from lightdepth.command_line.warned import warnings_as_sentences
-from lightdepth.errors import AlreadyFinished, InputError, MachineFailure, MissingOption, PartialFailure
+from lightdepth.errors import (
+    AlreadyFinished,
+    InputError,
+    Interrupted,
+    MachineFailure,
+    MissingOption,
+    PartialFailure,
+)
 
 GROUP = "lightdepth.commands"
 ORDER = (
@@ -56,8 +65,14 @@ def main(argv: list[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show ends no run
-    with outliving_readers(), warnings_as_sentences():
-        return _main(sys.argv[1:] if argv is None else argv)
+    given = sys.argv[1:] if argv is None else argv
+    try:
+        with ending_on_signals(), outliving_readers(), warnings_as_sentences():
+            return _main(given)
+    except Interrupted as error:
+        with suppress(OSError):  # the terminal may be what is gone
+            print(f"lightdepth {given[0] if given else ''}: {error}", file=sys.stderr, flush=True)
+        return 128 + error.signal
 
 
 def _main(argv: list[str]) -> int:
@@ -106,7 +121,7 @@ def _main(argv: list[str]) -> int:
         name = str(error.object).encode("utf-8", "backslashreplace").decode()
         print(f"lightdepth {verb}: {name[:300]}: a name that is not UTF-8; rename it", file=sys.stderr)
         return 3
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # where signals are not ours: outside the main thread
         print(f"lightdepth {verb}: interrupted", file=sys.stderr)
         return 130
 

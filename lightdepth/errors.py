@@ -6,6 +6,7 @@ command line prints it without a traceback and exits with 3. Our own mistakes st
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 
@@ -38,6 +39,22 @@ class MissingOption(InputError):
 
 class PartialFailure(RuntimeError):
     """Part of the work failed; the rest was done and written. Exit code 4; `run.json` says what failed."""
+
+
+class Interrupted(BaseException):
+    """A signal asked the program to end. Exit code 128 + its number; cleaning up comes first."""
+
+    signal: int
+    """Its number."""
+    kept: str
+    """What is kept and how to go on, or empty."""
+
+    def __init__(self, signal: int, kept: str = "") -> None:
+        super().__init__(signal, kept)
+        self.signal, self.kept = self.args
+
+    def __str__(self) -> str:
+        return f"stopped by {signal.Signals(self.signal).name}; {self.kept or 'nothing half-written is left'}"
 
 
 class MachineFailure(RuntimeError):
