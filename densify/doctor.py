@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -13,8 +14,13 @@ from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth import native
 from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
+from lightdepth.files.lock import locked
+from lightdepth.files.replacing import hidden, output_of, recover, remains
 from lightdepth.prediction import DepthPrediction
 from lightdepth.reporting.run import versions
+
+_MOST_FOLDERS = 200
+"""Folders in the current one in which remains of killed runs are looked for."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +36,7 @@ def examine() -> list[Check]:
     needed = ("torch", "lightning", "kornia", "numpy", "scipy", "pycolmap", "opencv-python-headless")
     findings = [Check("python", True, f"{found['python']} on {platform.machine()}, {os.cpu_count()} cores")]
     findings += [Check(name, name in found, found.get(name, f"missing: pip install {name}")) for name in needed]
-    findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), _torchvision()]
+    findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), _torchvision(), _remains(Path())]
     return findings
 
 
@@ -64,6 +70,28 @@ def _pycolmap() -> Check:
     except ImportError as error:
         return Check("pycolmap calls", False, f"{error}: pip install 'pycolmap>=4'")
     return Check("pycolmap calls", not missing, f"lacks {', '.join(missing)}" if missing else "all there")
+
+
+def _remains(folder: Path) -> Check:
+    """What runs that were killed left in a folder and those in it; a result that was moved aside comes back."""
+    found = [left for place in [folder, *_folders_in(folder)] for left in remains(place)]
+    for old in (path for path in found if path.suffix == ".old"):
+        output = output_of(old)
+        if output is not None:
+            with locked(output):
+                recover(output)
+    left = [str(path) for path in found if path.exists()]
+    if not left:
+        return Check("remains", True, "none of killed runs here")
+    named = ", ".join(left[:5]) + (f" and {len(left) - 5} more" if len(left) > 5 else "")
+    return Check("remains", True, f"of killed runs: {named}; the next run to the same place goes on or clears them up")
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    try:
+        return sorted(p for p in folder.iterdir() if p.is_dir() and not hidden(p))[:_MOST_FOLDERS]
+    except OSError:
+        return []
 
 
 def _torchvision() -> Check:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import inspect
 import io
+import os
 import sys
 from functools import partial
 from importlib import metadata, util
@@ -25,7 +26,7 @@ from lightdepth import __version__
 from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.command_line.pipes import outliving_readers
 from lightdepth.command_line.warned import warnings_as_sentences
-from lightdepth.errors import InputError, PartialFailure
+from lightdepth.errors import AlreadyFinished, InputError, MachineFailure, PartialFailure
 
 GROUP = "lightdepth.commands"
 ORDER = (
@@ -50,7 +51,8 @@ ORDER = (
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed."""
+    """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed, 5 the machine failed
+    (disk, memory, a folder that is gone), 128 + n ended by signal n."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show ends no run
@@ -90,6 +92,11 @@ def _main(argv: list[str]) -> int:
     except PartialFailure as error:
         print(f"lightdepth {verb}: {error}", file=sys.stderr)
         return 4
+    except AlreadyFinished as error:
+        print(f"lightdepth {verb}: {error}")
+        return 0
+    except (MachineFailure, OSError, MemoryError, RuntimeError) as error:
+        return _failed(verb, error)
     except UnicodeEncodeError as error:  # libraries that know UTF-8 alone
         if not any("\udc80" <= letter <= "\udcff" for letter in str(error.object)):
             raise
@@ -101,16 +108,34 @@ def _main(argv: list[str]) -> int:
         return 130
 
 
+def _failed(verb: str, error: Exception) -> int:
+    """One sentence for what the machine did (5), or for a file that cannot be used (3); other errors are ours."""
+    from lightdepth.files.machine import machine_failure
+
+    failure = error if isinstance(error, MachineFailure) else machine_failure(error)
+    if failure is not None:
+        print(f"lightdepth {verb}: {failure}", file=sys.stderr)
+        return 5
+    if not isinstance(error, OSError) or error.filename is None or isinstance(error.filename, int):
+        raise error
+    print(f"lightdepth {verb}: {os.fsdecode(error.filename)}: {error.strerror or error}", file=sys.stderr)
+    return 3
+
+
 def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
     from lightdepth.command_line.gone_settings import without_gone
     from lightdepth.command_line.options import with_groups
-    from lightdepth.command_line.parsing import fail, parsed
+    from lightdepth.command_line.parsing import config_files, fail, parsed
     from lightdepth.command_line.presets import with_preset
+    from lightdepth.files.replacing import check_apart
 
     parser = verb_parser(function, verb)
     argv = without_gone(verb, with_preset(verb, argv, partial(fail, parser)))
-    return with_groups(function, parser.instantiate(parsed(parser, argv)))
+    found = parsed(parser, argv)
+    if found.get("overwrite") and found.get("output"):
+        check_apart(Path(found["output"]), config_files(argv))
+    return with_groups(function, parser.instantiate(found))
 
 
 def verb_parser(function: Any, verb: str) -> Parser:

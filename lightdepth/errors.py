@@ -34,3 +34,11 @@ class InputError(ValueError):
 
 class PartialFailure(RuntimeError):
     """Part of the work failed; the rest was done and written. Exit code 4; `run.json` says what failed."""
+
+
+class MachineFailure(RuntimeError):
+    """The machine failed: a full disk, a folder that is gone, no memory. Exit code 5; says what was kept."""
+
+
+class AlreadyFinished(Exception):
+    """`--resume` of a run that is finished and the same: there is nothing to do. Exit code 0, one line."""

@@ -498,6 +498,23 @@ def test_doctor_finds_nothing_wrong_here(capsys):
         assert f"ok    {what}" in shown
 
 
+def test_doctor_brings_back_what_a_killed_run_had_moved_aside_and_lists_what_it_left(tmp_path, monkeypatch, capsys):
+    import densify.doctor
+
+    monkeypatch.setattr(densify.doctor, "_fused_plane", lambda: densify.doctor.Check("fused plane", True, ""))
+    (tmp_path / "runs" / ".dense.old").mkdir(parents=True)
+    record = {"verb": "densify", "versions": {}, "files": {}}
+    (tmp_path / "runs" / ".dense.old" / "run.json").write_text(json.dumps(record))
+    (tmp_path / ".other.unfinished").mkdir()
+    (tmp_path / ".other.unfinished" / "begun.json").write_text("")
+    (tmp_path / ".config.old").mkdir()  # of another program
+    monkeypatch.chdir(tmp_path)
+    assert lightdepth("doctor") == 0
+    shown = capsys.readouterr().out
+    assert ".other.unfinished" in shown and ".config.old" not in shown and ".dense.old" not in shown
+    assert left_in(tmp_path / "runs") == ["dense"]
+
+
 def test_doctor_says_what_is_missing_and_how_to_get_it(capsys, monkeypatch):
     import densify.doctor
 

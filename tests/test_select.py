@@ -335,7 +335,7 @@ def test_nothing_is_written_when_no_frame_is_kept_or_writing_fails(data, tmp_pat
     monkeypatch.setattr(
         "lightdepth.reporting.report.Report.write", lambda *_: (_ for _ in ()).throw(OSError(28, "disk full"))
     )
-    with refused(found="disk full"):
+    with pytest.raises(OSError, match="disk full"):
         select(data, tmp_path / "b" / "list.txt")
     assert not (tmp_path / "a").exists() and not list((tmp_path / "b").iterdir())
     for wrong in (tmp_path, tmp_path / "list.csv"):

@@ -47,7 +47,8 @@ def test_file_and_folder_are_on_the_disk_before_and_after_the_rename(tmp_path, m
     monkeypatch.setattr(os, "replace", lambda a, b: (order.append("replace"), real[1](a, b)))
     monkeypatch.setattr(os, "rename", lambda a, b: (order.append("rename"), real[2](a, b)))
     write_whole(tmp_path / "a", "x")
-    assert [os.path.basename(o) for o in order] == [".partial-a", "replace", tmp_path.name]
+    names = [os.path.basename(o) for o in order]
+    assert names[0].startswith(".partial-") and names[0].endswith("-a") and names[1:] == ["replace", tmp_path.name]
     order.clear()
     (tmp_path / "made" / "in").mkdir(parents=True)
     (tmp_path / "made" / "in" / "f").write_text("x")
@@ -66,6 +67,6 @@ def test_a_file_system_that_cannot_sync_folders_loses_nothing_and_a_full_one_is_
     write_whole(tmp_path / "a", "x")
     assert (tmp_path / "a").read_text() == "x"
     monkeypatch.setattr(os, "fsync", failing(errno.ENOSPC))
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(OSError, match="No space left"):  # the machine's failure, not the user's
         write_whole(tmp_path / "a", "y")
-    assert "No space left" in refused.value.found and (tmp_path / "a").read_text() == "x"
+    assert (tmp_path / "a").read_text() == "x"

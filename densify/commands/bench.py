@@ -26,6 +26,7 @@ from densify.config import DensifyConfig, OfflineConfig, Recipe
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
+from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
 from lightdepth.models import DepthModel
 from lightdepth.reporting.progress import Progress
@@ -133,6 +134,8 @@ def compare_runs(a: Path, b: Path, output: Path | None = None, seed: int = 0) ->
         seed: Number that draws the bootstrap samples, by which noise is told from difference. Another one gives
             slightly different intervals.
     """
+    if output is not None:
+        check_rewritable(output, '{\n "kind": "bench comparison"', [a, b])
     found = compare(read_bench(a), read_bench(b), seed)
     print(found.markdown(str(a), str(b)))
     if output is not None:

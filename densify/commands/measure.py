@@ -10,6 +10,7 @@ import numpy as np
 from densify.evaluation.judged_map import read_run
 from densify.measure import chosen_map, measured, places_in_frame, run_unit
 from lightdepth.errors import InputError
+from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
 from lightdepth.reporting.run import plain
 
@@ -44,6 +45,8 @@ def measure(
             in mm. A larger one makes them longer in proportion. It is refused where the surface is in mm already.
         output: JSON file to write the lengths and areas to, besides showing them. Left out, they are shown only.
     """
+    if output is not None:
+        check_rewritable(output, '{\n "run": ', [run])
     dense = chosen_map(read_run(run), map, run)
     unit = run_unit(run, mm_per_unit)
     if (points is None) == (pixels is None) or (pixels is None) != (frame is None):

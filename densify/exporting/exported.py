@@ -16,6 +16,7 @@ from densify.dense_map import DenseMapFiles, Surface, map_folders, read_dense_ma
 from densify.inputs import fitted_to_frames
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
+from lightdepth.files.below import given
 from lightdepth.geometry import depth_from_distance
 from lightdepth.maps import read_map
 from lightdepth.maps.endocartoscope import TrajectoryPose, read_trajectory, trajectory_path
@@ -150,7 +151,8 @@ def _submaps(path: Path, folder: Path, record: Mapping[str, object]) -> dict[int
 
 def _localised(path: Path, map_id: int, scale: float) -> tuple[TrajectoryPose, ...]:
     """All localised frames of a map in the tree of EndoCartoScope or CLiMB, in the surface's unit; none elsewhere."""
-    files = sorted(path.rglob(trajectory_path(path, map_id).name)) if path.is_dir() else []
+    name = trajectory_path(path, map_id).name
+    files = given(sorted(path.rglob(name)), path) if path.is_dir() else []
 
     def moved(pose: TrajectoryPose) -> TrajectoryPose:
         cam_from_map = pose.cam_from_map.copy()

@@ -171,7 +171,7 @@ def parsed(parser: Parser, argv: Sequence[str]) -> Namespace:
             print(parser.help_page(word in HELP_ALL), end="")
             raise SystemExit(0)
     parser.exit_on_error = False
-    for file in _config_files(argv):
+    for file in config_files(argv):
         _check_config(parser, file)
     try:
         return parser.parse_args(spelled(parser, argv))
@@ -276,7 +276,7 @@ def one_line(parser: Parser, argv: Sequence[str], message: str) -> str:
     elif found := re.search(r"argument (\S+?): expected one argument", message):
         said = f"{dashed(found[1].split('/')[0])} needs a value"
     elif found := re.search(r"Problems parsing config: (.*)", message, re.DOTALL):
-        files = [path for path in _config_files(argv) if not _is_yaml(path)]
+        files = [path for path in config_files(argv) if not _is_yaml(path)]
         said = f"{files[0] if files else '--config'}: not YAML: {' '.join(found[1].split())}"
     else:
         said = " ".join(message.split())
@@ -342,7 +342,8 @@ def _on_line(argv: Sequence[str], key: str) -> bool:
     return any(_underscored(word).partition("=")[0].startswith(f"--{key}") for word in argv)
 
 
-def _config_files(argv: Sequence[str]) -> Iterator[Path]:
+def config_files(argv: Sequence[str]) -> Iterator[Path]:
+    """The files that --config names among the words of a command line."""
     for word, following in pairwise([*argv, ""]):
         path = following if word == "--config" else word.removeprefix("--config=") if word[:9] == "--config=" else ""
         if path and "\n" not in path and Path(path).is_file():  # settings may stand there themselves (gone_settings)
@@ -374,7 +375,7 @@ def _is_yaml(path: Path) -> bool:
 def _file_with(argv: Sequence[str], key: str) -> str:
     """`FILE: ` for the last file of settings on the command line that has the key, else nothing."""
     result = ""
-    for path in _config_files(argv):
+    for path in config_files(argv):
         node: Any = read_settings(path) if _is_yaml(path) else None
         for part in key.split("."):
             node = node.get(part, _ABSENT) if isinstance(node, Mapping) else _ABSENT

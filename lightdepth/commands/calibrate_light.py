@@ -13,6 +13,7 @@ from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
 from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
+from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import write_together
 from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
@@ -56,9 +57,7 @@ def calibrate_light(
             f"{output} is a folder, or named as what is written beside it",
             "expected the name of a file to write, such as light.json",
         )
-    made = [path for path in (output, page_path) if path.exists()]
-    if made and not overwrite:
-        raise InputError(made[0], "already there", "choose another -o, or give --overwrite")
+    check_files([output, page_path], overwrite, [data, map, camera, mask])
     rng = np.random.default_rng(seed)
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth)
     if map is None:

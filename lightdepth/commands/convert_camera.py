@@ -9,6 +9,7 @@ from lightdepth import camera_conversion
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.datasets.sequence import read_mask
 from lightdepth.errors import InputError
+from lightdepth.files.replacing import check_files
 
 
 def convert_camera(
@@ -39,8 +40,7 @@ def convert_camera(
             Left out, half a percent of the image's longer side. A larger one lets a worse fit through.
         overwrite: Replace a file made before.
     """
-    if output.exists() and not overwrite:
-        raise InputError(output, "already there", "choose another -o, or give --overwrite")
+    check_files([output], overwrite, [file, mask])
     if size is not None and min(size) < 1:
         raise InputError("--size", f"{list(size)}", "expected a width and a height of some pixels")
     if most_px is not None and not most_px > 0:
@@ -67,6 +67,5 @@ def convert_camera(
             f"(largest), over the {100 * found.seen_share:.1f} % of the field that it can represent"
         )
         camera = found.camera
-    output.parent.mkdir(parents=True, exist_ok=True)
     write_camera(camera, output, to)
     print(f"{said}\n{output}")

@@ -16,6 +16,7 @@ from lightdepth.datasets.format import Format
 from lightdepth.datasets.sequence import FrameSequence, legible, list_images, no_images, read_mask
 from lightdepth.datasets.video_sequence import check_turned, open_clip, read_video, video_at
 from lightdepth.errors import InputError
+from lightdepth.files.below import folders_in
 from lightdepth.files.images import image_size
 from lightdepth.frame import check_image_size
 from lightdepth.photometry import PhotometricCalibration
@@ -151,7 +152,7 @@ def _folders_below(path: Path) -> str:
     found: list[Path] = []
     level = [path]
     for _ in range(_DEEP):
-        below = [p for folder in level for p in sorted(folder.iterdir())[:_MANY] if p.is_dir() and p.name != "truth"]
+        below = [p for folder in level for p in folders_in(folder)[:_MANY] if p.name != "truth"]
         found += [p for p in below if _is_sequence(p)]
         level = [p for p in below if p not in found]
     if not found:

@@ -31,6 +31,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lightdepth.datasets.catalogue import DatasetInfo, SequenceName, inside, read_dataset_yaml, read_yaml
 from lightdepth.errors import InputError
+from lightdepth.files.below import folders_in
 
 PARTS = ("train", "val", "test")
 _RANGE = re.compile(r"(.+?)\s*\[\s*(\d+)\s*:\s*(\d+)\s*\]")
@@ -263,7 +264,7 @@ def located(root: Path, name: str) -> Path | None:
         return root / name
     above = (root / name).parent
     key = same_sequence(name)
-    siblings = sorted(p for p in above.iterdir() if p.is_dir()) if above.is_dir() else []
+    siblings = folders_in(above) if above.is_dir() else []
     same = [p for p in siblings if same_sequence(f"{name.rpartition('/')[0]}/{p.name}".lstrip("/")) == key]
     if len(same) > 1:
         raise InputError(above, f"{' and '.join(p.name for p in same)} are both {name}", "keep one")

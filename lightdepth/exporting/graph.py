@@ -143,6 +143,8 @@ def write_onnx(program: torch.export.ExportedProgram, path: Path, outputs: tuple
             made = torch.onnx.export(program, input_names=names, output_names=list(outputs), verbose=False)
             assert made is not None
             made.save(path, external_data=False)
+    except (OSError, MemoryError):  # the machine's failure
+        raise
     except Exception as error:  # whatever the translation stumbles over
         raise InputError(path, f"no ONNX for this network ({_first(error)})", "export --to torch") from error
 

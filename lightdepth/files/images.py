@@ -17,6 +17,7 @@ import numpy as np
 
 from lightdepth.errors import InputError
 from lightdepth.files.headers import Header, as_stored, header_in, header_of, what_is_there
+from lightdepth.files.machine import FAILS
 
 PICTURE_SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".dib", ".tif", ".tiff", ".webp", ".jp2", ".j2k"),
@@ -121,6 +122,9 @@ def write_image(path: Path, pixels: np.ndarray, quality: int | None = None) -> N
     try:
         path.write_bytes(data.tobytes())
     except OSError as error:
+        if error.errno in FAILS:
+            error.filename = str(path)  # writing alone names none
+            raise
         raise InputError(path, f"cannot be written ({error.strerror or error})", "choose another place") from error
 
 

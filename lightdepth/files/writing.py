@@ -7,16 +7,27 @@ disk too. Files inside a run folder in the making need none of this: the folder 
 from __future__ import annotations
 
 import errno
+import glob
+import hashlib
 import os
+import re
+import socket
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from lightdepth.errors import InputError
+from lightdepth.files.machine import FAILS
 
 Content = str | bytes | Callable[[Path], object]
 """Text, bytes, or a function that writes a file at the path that it is given (the ending is that of the real one)."""
 
+
+PARTIAL = ".partial-"
+"""How names begin of what is not whole yet; then follow the machine, the process and the real name."""
+
+_LONGEST = 255
+"""What file systems take as a name, in bytes."""
 
 _NOT_HERE = (errno.EINVAL, errno.ENOTSUP)
 """Some file systems cannot bring a folder to the disk, and say so; a finished run is not lost over it."""
@@ -29,13 +40,14 @@ def write_whole(path: str | Path, content: Content) -> None:
 
 def write_together(contents: Mapping[Path, Content]) -> None:
     """Several files: nothing takes its place before all are written; then they do, in the order given."""
-    partial = {path: path.with_name(f".partial-{path.name}") for path in contents}
+    partial = {path: _partial(path) for path in contents}
     with ExitStack() as leftovers:
         for unfinished in partial.values():
             leftovers.callback(_remove, unfinished)
         try:
             for path, content in contents.items():
                 path.parent.mkdir(parents=True, exist_ok=True)
+                _clear_dead(path)
                 _write(partial[path], content)
                 sync(partial[path])
             for path in contents:
@@ -43,18 +55,42 @@ def write_together(contents: Mapping[Path, Content]) -> None:
             for folder in {path.parent for path in contents}:
                 sync(folder)
         except OSError as error:
-            where = error.filename or next(iter(contents))
+            real = {os.fspath(unfinished): path for path, unfinished in partial.items()}
+            where = real.get(error.filename, error.filename or next(iter(contents)))
+            if error.errno in FAILS:
+                error.filename = os.fspath(where)  # writing alone names none
+                raise
             raise InputError(where, f"cannot be written ({error.strerror or error})", "choose another place") from error
+
+
+def check_writable(path: Path) -> None:
+    """Raises InputError where a file cannot be written, before the work for it; nothing is left there."""
+    probe = _partial(path)
+    try:
+        existing = next(folder for folder in path.absolute().parents if folder.exists())
+        probe = existing / probe.name
+        probe.touch()
+    except OSError as error:
+        if error.errno in FAILS:
+            raise
+        raise InputError(path, f"cannot be written ({error.strerror or error})", "choose another place") from error
+    finally:
+        _remove(probe)
 
 
 def move_whole(made: Path, path: Path) -> None:
     """A finished folder takes its place: all that is in it is on the disk before it does."""
+    sync_below(made)
+    made.rename(path)
+    sync(path.parent)
+
+
+def sync_below(made: Path) -> None:
+    """Brings all that is in a folder to the disk."""
     for folder, _, files in os.walk(made):
         for file in files:
             sync(Path(folder) / file)
         sync(Path(folder))
-    made.rename(path)
-    sync(path.parent)
 
 
 def sync(path: Path) -> None:
@@ -69,6 +105,40 @@ def sync(path: Path) -> None:
             raise
     finally:
         os.close(descriptor)
+
+
+def is_dead_partial(path: Path) -> bool:
+    """Whether a file is what a process of this machine, which is dead, had written of one."""
+    found = re.fullmatch(rf"{re.escape(PARTIAL)}([0-9a-f]{{8}})-(\d{{1,9}})-.*", path.name, re.DOTALL)
+    if found is None or found[1] != _machine():
+        return False
+    try:
+        os.kill(int(found[2]), 0)
+    except ProcessLookupError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _partial(path: Path) -> Path:
+    """A name beside a file for what is written of it, with its ending, of this process alone."""
+    name = f"{PARTIAL}{_machine()}-{os.getpid()}-{path.name}"
+    if len(os.fsencode(name)) > _LONGEST:
+        name = f"{PARTIAL}{_machine()}-{os.getpid()}-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]}"
+        name += path.suffix
+    return path.with_name(name)
+
+
+def _clear_dead(path: Path) -> None:
+    """What killed runs had written of this file."""
+    for old in path.parent.glob(f"{PARTIAL}*-{glob.escape(path.name)}"):
+        if is_dead_partial(old):
+            _remove(old)
+
+
+def _machine() -> str:
+    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
 
 
 def _remove(path: Path) -> None:

@@ -17,6 +17,7 @@ from lightdepth.datasets.sequence import list_images, read_mask
 from lightdepth.datasets.video_calibration import found_calibration
 from lightdepth.datasets.video_sequence import open_clip, quick_sample, spread_pictures, video_at
 from lightdepth.errors import InputError
+from lightdepth.files.below import files_below
 from lightdepth.files.images import image_size, to_bgr8
 from lightdepth.photometry import PhotometricCalibration
 
@@ -79,7 +80,7 @@ def open_source(source: SequenceSource) -> tuple[Source, list[Path]]:
         mask=first.mask,
         no_camera=missing,
     )
-    return found, sorted(file for file in path.rglob("*") if file.is_file())
+    return found, files_below(path)
 
 
 def content_hash(files: list[Path]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from lightdepth.errors import InputError
+from lightdepth.files.below import folders_in, given
 from lightdepth.maps.colmap import holds_model, read_submap
 from lightdepth.maps.convention import COLMAP, EXPORTER, Reader
 from lightdepth.maps.endocartoscope import MAPS, read_exported_submap
@@ -90,7 +91,7 @@ def _multimap_tree(path: Path) -> Path | None:
         return path
     if (path / MAPS).is_dir():
         return path / MAPS
-    trees = sorted(path.glob(f"*/{MAPS}"))
+    trees = given(sorted(path.glob(f"*/{MAPS}")), path)
     if len(trees) > 1:
         found = ", ".join(t.parent.name for t in trees)
         raise InputError(
@@ -147,7 +148,7 @@ def _numbered(root: Path) -> dict[int, Path]:
     folders: dict[int, Path] = {}
     if not root.is_dir():
         return folders
-    for folder in sorted(p for p in root.iterdir() if p.is_dir() and _is_number(p.name)):
+    for folder in sorted(p for p in folders_in(root) if _is_number(p.name)):
         twin = folders.setdefault(int(folder.name), folder)
         if twin is not folder:
             raise InputError(

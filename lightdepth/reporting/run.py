@@ -1,31 +1,55 @@
 """Run folders: what a verb writes appears whole or not at all, and says how it was made.
 
-Work goes to a hidden folder beside OUT, which is renamed when it is complete; run.json is written last. A verb that
-fails leaves OUT as it was.
+Work goes to a hidden folder beside OUT, which is renamed when it is complete; run.json is written last, and lists the
+files. A verb that fails leaves OUT as it was; one that can be resumed keeps its finished parts in the hidden folder.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
 import platform
 import resource
-import shutil
 import subprocess
 import sys
-import tempfile
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
 from lightdepth.errors import InputError, PartialFailure
-from lightdepth.files.writing import move_whole, write_whole
+from lightdepth.files.lock import locked
+from lightdepth.files.machine import machine_failure
+from lightdepth.files.replacing import (
+    BEGUN,
+    PARTS,
+    check_apart,
+    check_replaceable,
+    discard,
+    listed,
+    real_output,
+    recover,
+    replace,
+    stamp,
+    try_place,
+    unfinished_path,
+)
+from lightdepth.files.writing import sync_below, write_whole
+from lightdepth.reporting.same import check_finished, check_same, compared
+from lightdepth.reporting.same import input_hash as input_hash
+from lightdepth.reporting.same import paths_in as paths_in
+from lightdepth.reporting.same import plain as plain
+from lightdepth.reporting.unfinished import (
+    Part,
+    add_part,
+    begin,
+    begun_with,
+    clean,
+    finished_parts,
+    new_files,
+)
 
 PACKAGES = (
     "lightdepth",
@@ -42,12 +66,59 @@ PACKAGES = (
 
 
 class Run:
-    """An output folder in the making. `folder` is where to write; `record` is what run.json will say besides."""
+    """An output folder in the making. `folder` is where to write, `output` what it becomes; `record` is what run.json
+    will say besides."""
 
-    def __init__(self, folder: Path, verb: str, arguments: Mapping[str, Any]):
-        self.folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        output: Path,
+        verb: str,
+        arguments: Mapping[str, Any],
+        parts: Mapping[str, Part] | None = None,
+    ) -> None:
+        self.folder, self.output = folder, output
         self.record: dict[str, Any] = {"failures": [], "warnings": []}
+        self.parts = None if parts is None else dict(parts)
+        self.resumed = bool(parts)
+        self._told: set[str] = set()  # finished parts whose reports are in the record
+        self._mark = (0, 0)
         self._verb, self._arguments, self._start = verb, plain(arguments), time.time()
+
+    def done(self, part: str) -> bool:
+        """Whether a part was finished before: its files are there, and its failures and warnings are in the record
+        now, where they would be had it run. Else it begins here: what is reported from now on is its own."""
+        found = (self.parts or {}).get(part)
+        if found is None:
+            self._mark = (len(self.record["failures"]), len(self.record["warnings"]))
+            return False
+        if part not in self._told:
+            self._told.add(part)
+            self.record["failures"] += found.failures
+            self.record["warnings"] += found.warnings
+        return True
+
+    def finish_part(self, part: str, files: Iterable[Path] | None = None, kept: Any = None) -> None:
+        """A part is whole: its files are on the disk, and a run that is resumed does not make it again.
+
+        `files` are the part's; None: all below the folder that no part has yet, which is slow where one folder holds
+        thousands. `kept` (plain values) is what `kept_of` gives back later. Does nothing where a verb cannot resume.
+        """
+        if self.parts is None:
+            return
+        if files is None:
+            sizes = new_files(self.folder, (name for each in self.parts.values() for name in each.files))
+        else:
+            sizes = {str(file.relative_to(self.folder)): file.stat().st_size for file in files}
+        failures, warned = self._mark
+        made = Part(part, sizes, self.record["failures"][failures:], self.record["warnings"][warned:], plain(kept))
+        add_part(self.folder, made, [self.folder / name for name in sizes])
+        self.parts[part] = made
+        self._told.add(part)
+
+    def kept_of(self, part: str) -> Any:
+        """What `finish_part` was given to keep, as JSON reads it back."""
+        return (self.parts or {})[part].kept
 
     def log(self, message: str) -> None:
         """A line for the user and for log.txt."""
@@ -72,7 +143,13 @@ class Run:
         """Notes what files and folders were read, by name; None is one that was not given."""
         for name, path in paths.items():
             if path is not None:
-                self.record.setdefault("inputs", {})[name] = {"path": str(path), "sha256": input_hash(path)}
+                self.record.setdefault("inputs", {})[name] = {
+                    "path": str(path),
+                    "sha256": input_hash(path, self.output),
+                }
+        if self.parts is not None and not self.resumed:
+            arguments = compared(self._arguments)
+            begin(self.folder, {"verb": self._verb, "arguments": arguments, "inputs": self.record.get("inputs", {})})
 
     @contextmanager
     def hearing(self) -> Iterator[None]:
@@ -102,7 +179,10 @@ class Run:
         import yaml
 
         (self.folder / "config.yaml").write_text(yaml.safe_dump(self._arguments, sort_keys=False), encoding="utf-8")
+        sync_below(self.folder)  # run.json says that the rest is whole: it comes last
         write_run_json(self.folder, self._verb, self._arguments, self._start, self.record)
+        for name in (BEGUN, PARTS):
+            (self.folder / name).unlink(missing_ok=True)
 
 
 def recorded(*groups: object, **options: object) -> dict[str, object]:
@@ -112,48 +192,111 @@ def recorded(*groups: object, **options: object) -> dict[str, object]:
 
 
 @contextmanager
-def run_folder(output: Path, verb: str, arguments: Mapping[str, Any], overwrite: bool = False) -> Iterator[Run]:
-    """A Run whose folder becomes `output` when the block ends well. Raises InputError when `output` is in use."""
-    output = Path(output)
-    if output.exists() and not output.is_dir():
-        raise InputError(output, "is a file", "expected a folder to make")
-    if output.is_dir() and any(output.iterdir()):
-        if not overwrite:
-            raise InputError(output, "already there and not empty", "choose another -o, or give --overwrite")
-        if not (output / "run.json").is_file():
-            raise InputError(
-                output,
-                "not overwritten, it has no run.json and so was not made by this program",
-                "choose another -o, or remove it yourself",
-            )
-        for name, value in arguments.items():
-            read = Path(value).resolve() if name != "output" and isinstance(value, str | Path) and value else None
-            if read is not None and read.is_relative_to(output.resolve()) and read.exists():
-                raise InputError(output, f"not overwritten, {value} is read from it", "choose another -o")
+def run_folder(
+    output: Path,
+    verb: str,
+    arguments: Mapping[str, Any],
+    overwrite: bool = False,
+    resume: bool | None = None,
+    inputs: Sequence[object] = (),
+) -> Iterator[Run]:
+    """A Run whose folder becomes `output` when the block ends well.
+
+    `resume` None: a verb that cannot be resumed; what it wrote goes when the block fails. Else finished parts
+    (`Run.finish_part`) are kept when it is killed or the machine fails, and `resume` True goes on from them. `inputs`
+    are those that do not stand among the arguments, which are looked through for others. Raises
+    InputError when `output` is in use, is or holds an input, or holds what is not of such a run; AlreadyFinished;
+    MachineFailure, with what was kept.
+    """
+    if resume and overwrite:
+        raise InputError("--resume, --overwrite", "they contradict each other", "give one of them")
+    real = real_output(output)
+    run = None
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        # Beside the target, so that the finished folder arrives by a rename; a name of its own: nothing is in its way.
-        staging = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
-        staging.chmod(0o755)
+        real.parent.mkdir(parents=True, exist_ok=True)
+        with locked(real):
+            run = _begun(real, verb, arguments, overwrite, resume, [*paths_in(arguments), *paths_in(inputs)])
+            before = stamp(real)
+            with _kept_or_gone(run, real, resume is not None), run.hearing():
+                yield run
+                run.finish()
+            replace(run.folder, real, before)
     except OSError as error:
-        raise InputError(output, f"cannot be made ({error.strerror})", "choose another -o") from error
-    run = Run(staging, verb, arguments)
-    try:
-        with run.hearing():
-            yield run
-        run.finish()
-    except BaseException:
-        shutil.rmtree(staging, ignore_errors=True)
-        raise
-    if output.is_dir():
-        shutil.rmtree(output)
-    move_whole(staging, output)
+        failure = machine_failure(error)
+        if failure is not None:
+            raise failure from error
+        if run is not None:
+            raise
+        cure = f"give a folder in it: -o {output / 'run'}" if real.is_dir() else "choose another -o"
+        raise InputError(output, f"cannot be made ({error.strerror})", cure) from error
     if run.record["failures"]:
         first = run.record["failures"][0]
         raise PartialFailure(
             f"{len(run.record['failures'])} part(s) failed, the first: {first['what']}: {first['reason']}. "
             f"The rest is in {output}"
         )
+
+
+def _begun(
+    output: Path,
+    verb: str,
+    arguments: Mapping[str, Any],
+    overwrite: bool,
+    resume: bool | None,
+    inputs: Iterable[Path],
+) -> Run:
+    """The run that is made or goes on, after all that can be refused before any work."""
+    if recover(output):
+        print(f"{output.name} was finished by an earlier run, which was killed at its last step", flush=True)
+    made = unfinished_path(output)
+    if output.is_dir() and any(output.iterdir()):
+        if overwrite:
+            check_apart(output, inputs)
+            check_replaceable(output, verb)
+        elif resume:
+            check_finished(output, verb, arguments)
+        else:
+            choices = "give --overwrite" if resume is None else "give --resume or --overwrite"
+            raise InputError(output, "already there and not empty", f"choose another -o, or {choices}")
+    begun, parts = begun_with(made), finished_parts(made)
+    if begun is not None and parts and not overwrite:
+        if not resume:
+            cure = f"--overwrite starts anew, and {begun['verb']} --resume goes on"
+            raise InputError(output, f"holds an unfinished run of {begun['verb']}", cure)
+        check_same(output, begun, verb, arguments)
+    else:
+        parts = {}
+        discard(made)
+        if resume:
+            print("nothing to resume: starting anew", flush=True)
+    try_place(output)
+    if parts:
+        clean(made, parts)
+        run = Run(made, output, verb, arguments, parts)
+        run.log(f"resumed: {len(parts)} finished part(s) are kept")
+        return run
+    made.mkdir(mode=0o755)
+    made.chmod(0o755)
+    begin(made, {"verb": verb, "arguments": compared(arguments), "inputs": {}})
+    return Run(made, output, verb, arguments, {} if resume is not None else None)
+
+
+@contextmanager
+def _kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
+    """A block that fails leaves nothing, or, of a run that can be resumed, its finished parts."""
+    try:
+        yield
+    except BaseException as error:
+        kept = bool(resumable and run.parts and not isinstance(error, InputError))
+        said = f"{len(run.parts or ())} finished part(s) are kept: --resume goes on" if kept else ""
+        failure = machine_failure(error, run.folder, said or f"Nothing of it is kept; {output.name} is as it was")
+        if not kept:
+            discard(run.folder)
+        elif failure is None:
+            error.add_note(said)
+        if failure is not None:
+            raise failure from error
+        raise
 
 
 def write_run_json(
@@ -170,6 +313,7 @@ def write_run_json(
         "seconds": round(time.time() - start, 3),
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
         **plain(record),
+        "files": listed(folder),
     }
     write_whole(folder / "run.json", json.dumps(data, indent=1) + "\n")
 
@@ -198,33 +342,3 @@ def git_revision() -> str | None:
         return None
     result: str | None = revision + ("+" if changed else "")
     return result
-
-
-def input_hash(path: Path) -> str:
-    """SHA-256 over names and sizes of the files below a path, and over the contents of those up to 1 MB."""
-    digest = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        size = file.stat().st_size
-        name = file.relative_to(path) if path.is_dir() else file.name
-        digest.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape"))
-        if size <= 1 << 20:
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
-
-
-def plain(value: Any) -> Any:
-    """Dataclasses, paths, tuples and numpy scalars as what JSON and YAML know."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return plain(asdict(value))
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None  # JSON has neither NaN nor infinity
-    return value

@@ -25,6 +25,9 @@ from lightdepth.reporting.run import git_revision
 from ..colons import TubeData, colon_seeds
 from .rows import JudgedColons, Row
 
+HEADING = "# What each ingredient of `"
+"""How every table begins."""
+
 METRICS = {"abs_rel": "AbsRel", "rmse_mm": "RMSE", "medae_mm": "MedAE"}
 _TOLD = {"true": "the true one", "wrong": "one .3 too high", "estimated": "one estimated per colon, without truth"}
 _SHOWN_POINTS = 6
@@ -224,7 +227,7 @@ def _head(table: AblationTable) -> str:
     steps = next(r.steps for r in table.results)
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     revision = git_revision() or "unknown"
-    return f"""# What each ingredient of `{table.title}` is worth
+    return f"""{HEADING}{table.title}` is worth
 
 Made by `{command}`
 (program of revision {revision}); not to be edited.

@@ -10,18 +10,32 @@ same frames of colons that none of them saw. Rows that are already there are kep
 
 from __future__ import annotations
 
-import shutil
+import re
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
-from lightdepth.errors import PartialFailure
+from lightdepth.errors import InputError, PartialFailure
+from lightdepth.files import replacing
+from lightdepth.files.lock import locked
+from lightdepth.files.replacing import (
+    check_replaceable,
+    check_rewritable,
+    hidden,
+    real_output,
+    recover,
+    stamp,
+    unfinished_path,
+)
 from lightdepth.reporting.run import recorded, write_run_json
+from lightdepth.reporting.same import paths_in
+from lightdepth.reporting.unfinished import begin
 
 from ..ablation.judge import Judge
 from ..ablation.plan import check, check_apart, plans_of
 from ..ablation.rows import JudgedColons, Row, Settings
 from ..ablation.run import finished, say, train_all
-from ..ablation.table import AblationTable, write_table
+from ..ablation.table import HEADING, AblationTable, Result, write_table
 from ..parser import training_parser
 from ..running import quiet
 
@@ -58,20 +72,58 @@ def ablate(
         table: Markdown file to which a copy of the table is written. Left out, it is in the run folder only.
         overwrite: Train all rows anew, also those already in the run folder. Without it, these are kept.
     """
-    started = time.time()
     arguments = recorded(
         output=output, base=base, settings=settings, rows=rows, judged=judged, seeds=seeds, table=table
     )
     check(output, rows, judged, seeds)
+    real = real_output(output)
+    if table is not None:
+        check_rewritable(table, HEADING, [base])
+    real.parent.mkdir(parents=True, exist_ok=True)
+    with locked(real):
+        recover(real)
+        before = stamp(real)
+        if overwrite and real.is_dir() and any(real.iterdir()):
+            replacing.check_apart(real, paths_in({**arguments, "table": None}))
+            check_replaceable(real, "ablate")
+            place = unfinished_path(real)  # the old one stays until the new one is whole
+            begin(place, {"verb": "ablate"})
+        else:
+            _check_ours(real)
+            place = real
+        failed = _ablate(place, base, settings, rows, judged, seeds, table, arguments)
+        if place != real:
+            (place / replacing.BEGUN).unlink(missing_ok=True)
+            replacing.replace(place, real, before)
+    say(f"table: {table or output / 'ablation.md'}")
+    if failed:
+        raise PartialFailure(f"{len(failed)} trainings failed, the first: {failed[0].row}: {failed[0].failed}")
+
+
+def _check_ours(output: Path) -> None:
+    """Raises InputError where a folder holds what no ablation writes: it would be listed as the run's."""
+    for path in sorted(output.iterdir()) if output.is_dir() else ():
+        if path.name not in _OURS and not re.fullmatch(r"seed_-?\d+", path.name) and not hidden(path):
+            raise InputError(output, f"holds {path.name}, which is of no ablation", "choose another -o")
+
+
+def _ablate(
+    output: Path,
+    base: Path,
+    settings: Settings | None,
+    rows: tuple[Row, ...],
+    judged: tuple[JudgedColons, ...],
+    seeds: tuple[int, ...],
+    table: Path | None,
+    arguments: Mapping[str, object],
+) -> list[Result]:
+    """Trains what is not in the folder yet, and writes the table; the trainings that failed."""
+    started = time.time()
     parser = training_parser()
     parser.exit_on_error = False
     plans = plans_of(parser, output, base, settings or {}, rows, judged, seeds)
     common = parser.instantiate(plans[0].config).data
     check_apart(common.tube, judged, seeds)
-    if overwrite:
-        for name in (*_OURS, *(f"seed_{seed}" for seed in {plan.seed for plan in plans})):
-            path = output / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     (output / "run.json").unlink(missing_ok=True)
     todo = [plan for plan in plans if finished(plan) is None]
     say(f"{len(plans)} trainings, {len(plans) - len(todo)} of them already there")
@@ -92,6 +144,4 @@ def ablate(
     failed = [r for r in made.results if r.failed]
     record = {"trainings": len(plans), "failures": [{"what": f"{r.row}, {r.seed}", "reason": r.failed} for r in failed]}
     write_run_json(output, "ablate", arguments, started, record)
-    say(f"table: {table or output / 'ablation.md'}")
-    if failed:
-        raise PartialFailure(f"{len(failed)} trainings failed, the first: {failed[0].row}: {failed[0].failed}")
+    return failed

@@ -21,6 +21,7 @@ from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.coloured import colours_of
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.errors import InputError
+from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import Content, write_together
 from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
@@ -99,7 +100,11 @@ def select(
             frames.
         overwrite: Replace the files of an earlier run. Without it, files that are already there are refused.
     """
-    paths = _paths(output, no_frames, overwrite)
+    paths = _paths(output)
+    check_files(paths.values(), overwrite, [data, map, camera, mask])
+    if output.resolve().parent == data.resolve() and not no_frames and any(c.isdigit() for c in output.stem):
+        found = f"{paths['sheet'].name}, among the frames, would be taken for one: it has a number"
+        raise InputError("-o", found, "choose a name without digits, another folder, or --no-frames")
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=config.bit_depth)
     sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, reading)
     frames = frames.without_truth()
@@ -145,7 +150,7 @@ def select(
     print(f"{summary}\n{', '.join(str(path) for path in writers)}")
 
 
-def _paths(output: Path, no_frames: bool, overwrite: bool) -> dict[str, Path]:
+def _paths(output: Path) -> dict[str, Path]:
     if output.is_dir() or output.suffix in (".csv", ".html", ".png"):
         raise InputError(
             "-o",
@@ -156,9 +161,6 @@ def _paths(output: Path, no_frames: bool, overwrite: bool) -> dict[str, Path]:
     paths = {"list": output}
     for what, ending in (("table", ".csv"), ("sheet", "_contact.png"), ("page", ".html")):
         paths[what] = beside.with_name(beside.name + ending)
-    there = [path for path in paths.values() if path.exists()]
-    if there and not overwrite:
-        raise InputError(there[0], "already there", "choose another -o, or give --overwrite")
     return paths
 
 

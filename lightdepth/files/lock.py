@@ -1,0 +1,144 @@
+"""One run at a time into an output: a lock file beside it, with who holds it.
+
+The kernel holds the lock (flock) and lets it go when the process dies, however it dies; the words in the file are for
+people, and for other machines, whose kernels do not know of each other.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from lightdepth.errors import InputError
+
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+
+
+@contextmanager
+def locked(output: Path) -> Iterator[None]:
+    """Within it no other run writes to `output`. Raises InputError, naming host, process and time, when one does."""
+    path = lock_path(output)
+    descriptor = _opened(path, output)
+    try:
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
+        yield
+    finally:
+        if _is_at(descriptor, path):
+            path.unlink(missing_ok=True)  # while it is held: whoever waits for it sees that it is gone
+        os.close(descriptor)
+
+
+def lock_path(output: Path) -> Path:
+    """Where the lock of an output is."""
+    return output.with_name(f".{output.name}.lock")
+
+
+def is_live(output: Path) -> bool:
+    """Whether a run writes to `output` now, as far as this machine can know: what another machine holds counts."""
+    try:
+        descriptor = os.open(lock_path(output), os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return not _is_ours(_read(descriptor))
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)
+
+
+def is_lock(path: Path) -> bool:
+    """Whether a file is a lock of ours."""
+    try:
+        with path.open("rb") as file:
+            found = _read(file.fileno())
+    except OSError:
+        return False
+    return {"host", "pid", "time"} <= set(found)
+
+
+def _opened(path: Path, output: Path) -> int:
+    """The lock file, held."""
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = _read(descriptor)
+            os.close(descriptor)
+            raise InputError(
+                output, f"another run writes to it ({_told(holder)})", "wait for its end, or choose another -o"
+            ) from None
+        except OSError:  # a file system without locks: the process alone tells
+            holder = _read(descriptor)
+            if holder and _is_ours(holder) and _lives(holder):
+                os.close(descriptor)
+                raise InputError(
+                    output, f"another run writes to it ({_told(holder)})", f"wait for its end, or remove {path}"
+                ) from None
+        if not _is_at(descriptor, path):  # its holder has just removed it
+            os.close(descriptor)
+            continue
+        holder = _read(descriptor)
+        if holder and not _is_ours(holder):
+            os.close(descriptor)
+            raise InputError(
+                output,
+                f"a run on another machine writes to it ({_told(holder)})",
+                f"wait for its end; if it is dead, remove {path}",
+            )
+        return descriptor
+
+
+def _ourselves() -> dict[str, Any]:
+    boot = _BOOT.read_text(encoding="ascii").strip() if _BOOT.is_file() else ""
+    started = time.strftime("%Y-%m-%d %H:%M:%S")
+    return {"host": socket.gethostname(), "boot": boot, "pid": os.getpid(), "time": started}
+
+
+def _is_ours(holder: dict[str, Any]) -> bool:
+    """Whether its holder ran on this machine, so that our lock tells that it is dead: by the name, or, of another
+    container on it, by when it started."""
+    ours = _ourselves()
+    same_boot = bool(ours["boot"]) and holder.get("boot") == ours["boot"]
+    return not holder or holder.get("host") == ours["host"] or same_boot
+
+
+def _lives(holder: dict[str, Any]) -> bool:
+    try:
+        os.kill(int(holder["pid"]), 0)
+    except PermissionError:
+        return True
+    except (OSError, KeyError, TypeError, ValueError, OverflowError):
+        return False
+    return True
+
+
+def _read(descriptor: int) -> dict[str, Any]:
+    try:
+        found = json.loads(os.pread(descriptor, 4096, 0))
+    except (ValueError, OSError):
+        return {}  # its holder had not written yet
+    return found if isinstance(found, dict) else {}
+
+
+def _told(holder: dict[str, Any]) -> str:
+    if not holder:
+        return "it has just begun"
+    return f"host {holder.get('host')}, process {holder.get('pid')}, since {holder.get('time')}"
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except OSError:
+        return False

@@ -1,0 +1,83 @@
+"""What the machine does wrong: a full disk, a folder that is gone, memory that ran out; told apart from bad input.
+
+Python and the libraries say these in many ways; here each becomes one sentence, with the disk and what is free on it.
+"""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from pathlib import Path
+
+from lightdepth.errors import MachineFailure
+
+FAILS = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the quota of the disk is used up",
+    errno.EFBIG: "a file grew beyond the size that is allowed here",
+    errno.EIO: "the disk could not be read or written",
+    errno.EROFS: "the disk is read-only",
+    errno.ESTALE: "the folder is gone from its server",
+    errno.ENODEV: "the disk is gone",
+    errno.ENXIO: "the disk is gone",
+    errno.ENOTCONN: "the server of the folder does not answer",
+    errno.ETIMEDOUT: "the server of the folder does not answer",
+    errno.ENOMEM: "the memory is used up",
+    errno.EMFILE: "too many files are open",
+    errno.ENFILE: "too many files are open",
+}
+"""What no other input would cure, by the number that the system gives."""
+
+_FULL = 1 << 20
+"""A disk with less room than this, in bytes, when a writer failed: then that is why. Libraries do not always say."""
+
+_MEMORY = ("can't allocate memory", "out of memory", "Insufficient memory", "Cannot allocate memory", "bad_alloc")
+
+
+def machine_failure(error: BaseException, folder: Path | None = None, kept: str = "") -> MachineFailure | None:
+    """The failure of the machine that `error` tells of, or None. `folder` is where the work was being written,
+    `kept` a sentence on what is left of it."""
+    reason = _reason(error, folder)
+    if reason is None:
+        return None
+    named = getattr(error, "filename", None)
+    named = None if isinstance(named, int) else named  # a descriptor says nothing to a reader
+    if reason == FAILS[errno.ENOMEM]:
+        return MachineFailure(". ".join(filter(None, (reason, kept))))
+    where = Path(str(named)) if named is not None else folder
+    said = reason if where is None else f"{_shown(where, folder)}: {reason}{_room(where)}"
+    return MachineFailure(". ".join(filter(None, (said, kept))))
+
+
+def _reason(error: BaseException, folder: Path | None) -> str | None:
+    if isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and any(sign in str(error) for sign in _MEMORY)
+    ):
+        return FAILS[errno.ENOMEM]
+    if isinstance(error, OSError) and error.errno in FAILS:
+        return FAILS[error.errno]
+    if folder is None or not isinstance(error, Exception):
+        return None
+    if not folder.is_dir():
+        return "the folder that was being written to is gone"
+    try:
+        full = shutil.disk_usage(folder).free < _FULL
+    except OSError:
+        return FAILS[errno.EIO]
+    return FAILS[errno.ENOSPC] if full else None
+
+
+def _shown(where: Path, folder: Path | None) -> Path:
+    """The path, without the hidden folder that only we know."""
+    if folder is not None and where.is_relative_to(folder):
+        return folder.parent
+    return where
+
+
+def _room(path: Path) -> str:
+    for place in (path, *path.parents):
+        try:
+            return f" ({shutil.disk_usage(place).free / 1e6:.1f} MB are free)"
+        except OSError:
+            continue
+    return ""

@@ -1,0 +1,92 @@
+"""What a run is of: its inputs by their contents, its arguments as plain values, and whether two runs are the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from lightdepth.errors import AlreadyFinished, InputError
+from lightdepth.files.below import files_below
+from lightdepth.files.replacing import read_record
+
+
+def check_finished(output: Path, verb: str, arguments: Mapping[str, Any]) -> None:
+    """Raises AlreadyFinished when the same run is finished there, else InputError."""
+    record = read_record(output)
+    if record is None:
+        raise InputError(output, "not resumed, it holds no run of this program", "choose another -o")
+    check_same(output, record, verb, arguments)
+    raise AlreadyFinished(f"{output.name} is already finished")
+
+
+def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Mapping[str, Any]) -> None:
+    """Raises InputError, naming what differs, unless this is the run that was begun there."""
+    if begun["verb"] != verb:
+        raise InputError(output, f"not resumed, it is of {begun['verb']}, not of {verb}", "choose another -o")
+    now, then = compared(arguments), compared(begun.get("arguments") or {})
+    for name in dict.fromkeys([*now, *then]):
+        if now.get(name) != then.get(name):
+            found = f"not resumed, --{name.replace('_', '-')} was {then.get(name)!r} and is {now.get(name)!r}"
+            raise InputError(output, found, "give the same options, or --overwrite to start anew")
+    for name, known in (begun.get("inputs") or {}).items():
+        path = Path(str(arguments.get(name) or known.get("path") or ""))
+        if "sha256" in known and not (path.exists() and input_hash(path, output) == known["sha256"]):
+            raise InputError(output, f"not resumed, {name} has changed since", "--overwrite starts anew")
+
+
+def compared(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments that decide what comes out, as JSON reads them back."""
+    chosen = {name: value for name, value in arguments.items() if name not in ("output", "overwrite", "resume")}
+    same: dict[str, Any] = json.loads(json.dumps(plain(chosen)))
+    return same
+
+
+def paths_in(value: Any) -> list[Path]:
+    """Every path among arguments, also in lists and groups; text counts, as it may name one. Not the output's."""
+    if isinstance(value, Path):
+        return [value]
+    if isinstance(value, str):
+        return [Path(value)] if value and "\0" not in value else []
+    if is_dataclass(value) and not isinstance(value, type):
+        return paths_in(vars(value))
+    if isinstance(value, Mapping):
+        return [path for name, each in value.items() if name != "output" for path in paths_in(each)]
+    if isinstance(value, list | tuple | set | frozenset):
+        return [path for each in value for path in paths_in(each)]
+    return []
+
+
+def input_hash(path: Path, without: Path | None = None) -> str:
+    """SHA-256 over names and sizes of the files below a path, and over the contents of those up to 1 MB. Results of
+    runs below it are passed over, and so is `without`, a folder that is being made."""
+    digest = hashlib.sha256()
+    files = files_below(path, without) if path.is_dir() else [path]
+    for file in files:
+        size = file.stat().st_size
+        name = file.relative_to(path) if path.is_dir() else file.name
+        digest.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape"))
+        if size <= 1 << 20:
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def plain(value: Any) -> Any:
+    """Dataclasses, paths, tuples and numpy scalars as what JSON and YAML know."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None  # JSON has neither NaN nor infinity
+    return value
