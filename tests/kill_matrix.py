@@ -45,7 +45,7 @@ VERBS = (
     ),
     Verb(
         "ablate",
-        ("ablate", "--config", "ablate.yaml", "-o", "out", "--rows", "[full]", "--seeds", "0"),
+        ("ablate", "--config", "ablate.yaml", "-o", "out"),
         "out",
         overwrites=False,
         in_place=True,
@@ -83,6 +83,9 @@ TRAIN = """data: {sequences: [synth], size: [80, 64], batch_size: 2, tube: {scen
 trainer: {max_steps: 6, accelerator: cpu, log_every_n_steps: 2, val_check_interval: 2}
 """
 ABLATE = """base: train.yaml
+rows: [{name: ours, change: nothing}, {name: smooth, change: more smoothness, settings: {model.loss.smoothness: 1.0}}]
+judged: [{name: colons, make: realistic, strength: weak, first: 400, count: 1}]
+seeds: [0]
 """
 SCENE = ("--seed", "3", "--slam.kind", "independent", "--slam.keyframe-every", "1")
 MADE = (

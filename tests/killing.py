@@ -149,9 +149,9 @@ def _count(folder: Path, notes: int, at: int | None, number: int) -> None:
         if not named or os.getpid() != own:
             return
         os.write(notes, (json.dumps([kind, *named]) + "\n").encode())
-        if seen == at:
-            os.kill(own, number)
         seen += 1
+        if seen - 1 == at:  # counted before: the signal may end this function by an exception
+            os.kill(own, number)
 
     sys.addaudithook(heard)
 
@@ -321,7 +321,7 @@ def _strays(folder: Path, reference: Path) -> list[str]:
 def drawn(verb: Verb, events: list[Event], count: int, draw: Callable[[int], list[int]]) -> list[int]:
     """Which events a verb is killed at: those around a rename into place, and others that `draw` orders by chance."""
     around = [i for i, event in enumerate(events) if event.places(verb.output)]
-    around = sorted({i for at in around for i in (at, at + 1)})
+    around = sorted({i for at in around for i in (at, at + 1) if i < len(events)})
     others = [i for i in draw(len(events)) if i not in around]
     half = around if len(around) <= count // 2 else around[:2] + around[-(count // 2 - 2) :]
     return sorted([*half, *others[: count - len(half)]])
