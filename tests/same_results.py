@@ -128,6 +128,7 @@ PLANTED = {
 they make and would differ for that alone; c3vd and predict_self are the same verbs."""
 
 LEFT_OUT = {"seconds", "started", "command", "versions", "revision", "peak_memory_mb", "arguments", "timings", "inputs"}
+LEFT_OUT |= {"files", "resumed"}
 """Keys of JSON: times, the machine, and how the run was asked for."""
 PASSED_OVER = ("config.yaml", "log.txt", "timings.csv", "timings.png", "tensorboard", "model.md")
 """Settings and times once more, and the card that model.safetensors holds as well."""
@@ -258,19 +259,19 @@ def compared(base: Path, head: Path, name: str, tolerance: float) -> Iterator[st
     codes = [json.loads((folder / f"{name}.done").read_text())["code"] for folder in (base, head)]
     if codes[0] != codes[1]:
         yield f"{name}: exit code {codes[0]} became {codes[1]}"
-    before, after = _files(base / name), _files(head / name)
+    before, after = files(base / name), files(head / name)
     for only, where in ((before - after, "BASE"), (after - before, "HEAD")):
         yield from (f"{name}/{path}: only in {where}" for path in sorted(map(str, only)))
     if name in COUNTED and tolerance:
         yield from _counted(base / name, head / name, name)
         return
     for path in sorted(before & after):
-        said = _difference(base / name / path, head / name / path, tolerance)
+        said = difference(base / name / path, head / name / path, tolerance)
         if said:
             yield f"{name}/{path}: {said if len(said) < 300 else f'{said[:140]} ... {said[-140:]}'}"
 
 
-def _files(folder: Path) -> set[Path]:
+def files(folder: Path) -> set[Path]:
     files = (path for path in folder.rglob("*") if path.is_file())
     return {
         path.relative_to(folder)
@@ -279,7 +280,7 @@ def _files(folder: Path) -> set[Path]:
     }
 
 
-def _difference(base: Path, head: Path, tolerance: float) -> str:
+def difference(base: Path, head: Path, tolerance: float) -> str:
     """What differs between two files of one kind; empty where nothing does."""
     if base.read_bytes() == head.read_bytes():
         return ""

@@ -1,0 +1,191 @@
+"""Kills every verb at drawn events of the file system, and holds what is left against undisturbed runs.
+
+    python tests/kill_matrix.py [--seed 1] [--events 12] [--only predict,train] [--into runs/kill]
+
+Each verb is killed at `--events` events over its whole run, those around a rename into place always among them, by
+SIGKILL and by one of SIGTERM and SIGINT, once where no result is there and once where an older one is replaced. What
+has been played is in INTO/SEED.jsonl and is not played again. Exit code 1 when something did not hold.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import sys
+import time
+from pathlib import Path
+
+for _library in ("OMP", "MKL", "OPENBLAS", "NUMBA"):  # before any of them is imported: bit for bit on one thread
+    os.environ[f"{_library}_NUM_THREADS"] = "1"
+if hasattr(os, "sched_setaffinity"):  # Open3D counts cores, and writes the same triangles in another order on more
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+from killing import Case, Stage, Verb, drawn, run
+
+ON_MAP = ("--map", "synth/slam", "--checkpoint", "decline")
+VERBS = (
+    Verb("synth", ("synth", "-o", "out", "--frames", "4", "--size", "[48, 40]"), "out", ("--seed", "9")),
+    Verb("import", ("import", "synth", "-o", "out", "--every", "2"), "out", ("--every", "3"), resumes=True),
+    Verb("calibrate-light", ("calibrate-light", "synth", "-o", "out/light.json", *ON_MAP[:2]), "out", overwrites=False),
+    Verb("convert-camera", ("convert-camera", "synth/camera.json", "-o", "out/camera.xml"), "out", overwrites=False),
+    Verb("select", ("select", "wide", "-o", "out/list.txt"), "out", overwrites=False),
+    Verb("train", ("train", "--config", "train.yaml", "-o", "out"), "out", ("--seed", "5"), resumes=True, in_place=True),
+    Verb(
+        "adapt",
+        (
+            *("adapt", "synth", "-o", "out", "--map", "synth/slam", "--steps", "2", "--batch-size", "2"),
+            *("--points", "0.5", "--held-out", "0.5", "--keep-worse"),
+        ),
+        "out",
+        ("--seed", "5"),
+        resumes=True,
+    ),
+    Verb(
+        "ablate",
+        ("ablate", "--config", "ablate.yaml", "-o", "out"),
+        "out",
+        overwrites=False,
+        in_place=True,
+    ),
+    Verb(
+        "predict",
+        ("predict", "synth", "-o", "out", "--checkpoint", "decline"),
+        "out",
+        ("--no-previews",),
+        resumes=True,
+    ),
+    Verb("sparse", ("sparse", "wide", "-o", "out"), "out", ("--sfm.peak-threshold", "0.004"), resumes=True),
+    Verb("densify", ("densify", "synth", "-o", "out", *ON_MAP), "out", ("--no-merge",), resumes=True),
+    Verb("live", ("live", "synth", "-o", "out", *ON_MAP), "out", ("--mm-per-unit", "2")),
+    Verb("evaluate", ("evaluate", "predict", "--truth", "synth", "-o", "out"), "out", ("--max-depth-mm", "20")),
+    Verb(
+        "bench",
+        ("bench", "-o", "out", "--checkpoints", "[decline]", "--image-size", "[64, 48]"),
+        "out",
+        ("--first-seed", "7"),
+        resumes=True,
+    ),
+    Verb(
+        "measure",
+        ("measure", "dense", "-o", "out/lengths.json", "--map", "0", "--points", "[[0, 0, 30], [4, 2, 31]]"),
+        "out",
+        overwrites=False,
+    ),
+    Verb("export", ("export", "dense", "-o", "out", "--to", "ply"), "out", ("--to", "obj")),
+    Verb("demo", ("demo", "-o", "out", "--frames", "8", "--size", "[96, 80]"), "out", ("--seed", "9")),
+)
+QUICK = ("predict", "export", "train")
+"""Those of which `make test` kills a few."""
+TRAIN = """data: {sequences: [synth], size: [80, 64], batch_size: 2, tube: {scenes: 0, val_scenes: 0}}
+trainer: {max_steps: 6, accelerator: cpu, log_every_n_steps: 2, val_check_interval: 2}
+"""
+ABLATE = """base: train.yaml
+rows: [{name: ours, change: nothing}, {name: smooth, change: more smoothness, settings: {model.loss.smoothness: 1.0}}]
+judged: [{name: colons, make: realistic, strength: weak, first: 400, count: 1}]
+seeds: [0]
+"""
+SCENE = ("--seed", "3", "--slam.kind", "independent", "--slam.keyframe-every", "1")
+MADE = (
+    ("synth", ("synth", "-o", "synth", "--frames", "10", "--size", "[96, 80]", *SCENE)),
+    ("wide", ("synth", "-o", "wide", "--frames", "16", "--size", "[160, 128]", *SCENE)),
+    ("predict", ("predict", "synth", "-o", "predict", "--checkpoint", "decline")),
+    ("dense", ("densify", "synth", "-o", "dense", *ON_MAP)),
+)
+
+
+def import_all() -> None:
+    """What a child would import first, which takes longer than its work. No library gets a thread to work in yet."""
+    import torch
+
+    torch.set_num_threads(1)
+    import lightning.pytorch  # noqa: F401
+
+    import densify.commands.bench
+    import densify.commands.densify
+    import densify.commands.demo
+    import densify.commands.live  # noqa: F401
+    import lightdepth.cli
+    import train.commands.adapt
+    import train.commands.train  # noqa: F401
+    from lightdepth import native
+
+    native.pycolmap()
+    native.open3d()
+
+
+def inputs(home: Path, needed: tuple[str, ...] = ("synth", "wide", "predict", "dense")) -> Path:
+    """The folder of inputs that the verbs find, made once."""
+    folder = home / "inputs"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "train.yaml").write_text(TRAIN, encoding="utf-8")
+    (folder / "ablate.yaml").write_text(ABLATE, encoding="utf-8")
+    for name, argv in MADE:
+        if name in needed and not (folder / name).exists():
+            ended, _ = run(list(argv), folder)
+            assert ended.code == 0, ended.said
+    return folder
+
+
+def cases(stage: Stage, verb: Verb, seed: int, count: int) -> list[Case]:
+    """The cases of a verb that a seed draws."""
+    rng, found = random.Random(f"{seed} {verb.name}"), []
+    for over in (False, True) if verb.overwrites else (False,):
+        events = stage.events(verb, over)
+        for at in drawn(verb, events, count, lambda n: rng.sample(range(n), n)):
+            found += [Case(verb, at, each, over) for each in (signal.SIGKILL, rng.choice([signal.SIGTERM, signal.SIGINT]))]
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--events", type=int, default=12, help="of each verb, for each kind of signal")
+    parser.add_argument("--only", default="", help="verbs, comma between them")
+    parser.add_argument("--into", type=Path, default=Path("runs/kill"))
+    given = parser.parse_args()
+    only = [name for name in given.only.split(",") if name]
+    if unknown := set(only) - {verb.name for verb in VERBS}:
+        parser.error(f"--only {', '.join(sorted(unknown))}; expected some of {', '.join(verb.name for verb in VERBS)}")
+    import_all()
+    stage = Stage(given.into, inputs(given.into.resolve()))
+    notes = given.into / f"{given.seed}.jsonl"
+    played = {}
+    if notes.is_file():
+        rows = (json.loads(line) for line in notes.read_text(encoding="utf-8").splitlines())
+        played = {row["case"]: row["wrong"] for row in rows}
+    print(f"seed {given.seed}, {given.events} events of each verb; {len(played)} cases are in {notes}", flush=True)
+    broken = total = 0
+    for verb in VERBS:
+        if only and verb.name not in only:
+            continue
+        start = time.monotonic()
+        try:
+            todo = cases(stage, verb, given.seed, given.events)
+        except AssertionError as error:
+            print(f"{verb.name}: cannot be played: {error}", flush=True)
+            broken += 1
+            continue
+        bad = 0
+        for case in todo:
+            if case.key not in played:
+                try:
+                    played[case.key] = stage.play(case)
+                except TimeoutError as error:
+                    played[case.key] = [str(error)]
+                with notes.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"case": case.key, "wrong": played[case.key]}) + "\n")
+            if wrong := played[case.key]:
+                bad += 1
+                event = stage.events(verb, case.over)[case.at]
+                print(f"  {case.key} ({event.kind} {' '.join(event.paths)}):", *wrong, sep="\n    ", flush=True)
+        print(f"{verb.name}: {len(todo) - bad} of {len(todo)} hold ({time.monotonic() - start:.0f} s)", flush=True)
+        broken, total = broken + bad, total + len(todo)
+    print(f"{total - broken} of {total} cases hold")
+    return 1 if broken else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
