@@ -46,6 +46,10 @@ COUNT ?= 300
 mutants: setup
 	PYTHONPATH=tests $(BIN)/python -m mutants --seed $(SEED) --count $(COUNT)
 
+# Every verb killed at drawn events of the file system; hours. What was played is kept: make kill SEED=2 ONLY=predict,train
+kill: setup
+	$(BIN)/python tests/kill_matrix.py --seed $(or $(SEED),1) --only "$(ONLY)"
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

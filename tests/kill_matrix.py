@@ -23,7 +23,7 @@ for _library in ("OMP", "MKL", "OPENBLAS", "NUMBA"):  # before any of them is im
 if hasattr(os, "sched_setaffinity"):  # Open3D counts cores, and writes the same triangles in another order on more
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
-from killing import Case, Stage, Verb, drawn, run
+from killing import Case, Stage, Verb, drawn, run  # noqa: E402 - the threads of libraries come first
 
 ON_MAP = ("--map", "synth/slam", "--checkpoint", "decline")
 VERBS = (
@@ -32,7 +32,9 @@ VERBS = (
     Verb("calibrate-light", ("calibrate-light", "synth", "-o", "out/light.json", *ON_MAP[:2]), "out", overwrites=False),
     Verb("convert-camera", ("convert-camera", "synth/camera.json", "-o", "out/camera.xml"), "out", overwrites=False),
     Verb("select", ("select", "wide", "-o", "out/list.txt"), "out", overwrites=False),
-    Verb("train", ("train", "--config", "train.yaml", "-o", "out"), "out", ("--seed", "5"), resumes=True, in_place=True),
+    Verb(
+        "train", ("train", "--config", "train.yaml", "-o", "out"), "out", ("--seed", "5"), resumes=True, in_place=True
+    ),
     Verb(
         "adapt",
         (
@@ -98,18 +100,15 @@ MADE = (
 
 def import_all() -> None:
     """What a child would import first, which takes longer than its work. No library gets a thread to work in yet."""
+    import importlib
+
     import torch
 
     torch.set_num_threads(1)
-    import lightning.pytorch  # noqa: F401
-
-    import densify.commands.bench
-    import densify.commands.densify
-    import densify.commands.demo
-    import densify.commands.live  # noqa: F401
-    import lightdepth.cli
-    import train.commands.adapt
-    import train.commands.train  # noqa: F401
+    for name in ("train.commands.adapt", "train.commands.train", "densify.commands.bench", "densify.commands.demo"):
+        importlib.import_module(name)
+    for name in ("densify.commands.densify", "densify.commands.live", "lightdepth.cli"):
+        importlib.import_module(name)
     from lightdepth import native
 
     native.pycolmap()
@@ -135,7 +134,9 @@ def cases(stage: Stage, verb: Verb, seed: int, count: int) -> list[Case]:
     for over in (False, True) if verb.overwrites else (False,):
         events = stage.events(verb, over)
         for at in drawn(verb, events, count, lambda n: rng.sample(range(n), n)):
-            found += [Case(verb, at, each, over) for each in (signal.SIGKILL, rng.choice([signal.SIGTERM, signal.SIGINT]))]
+            found += [
+                Case(verb, at, each, over) for each in (signal.SIGKILL, rng.choice([signal.SIGTERM, signal.SIGINT]))
+            ]
     return found
 
 

@@ -65,7 +65,9 @@ class Ended:
     said: str
 
 
-def run(argv: list[str], folder: Path, at: int | None = None, number: int = signal.SIGKILL) -> tuple[Ended, list[Event]]:
+def run(
+    argv: list[str], folder: Path, at: int | None = None, number: int = signal.SIGKILL
+) -> tuple[Ended, list[Event]]:
     """Runs a verb in `folder` in a forked child, which gets signal `number` at event `at`; the events up to its end."""
     notes, log = folder.with_name(folder.name + ".events"), folder.with_name(folder.name + ".log")
     notes.write_text("", encoding="utf-8")
@@ -255,7 +257,9 @@ class Stage:
             resumes = ["--overwrite"]
         restarted, _ = run([*verb.argv, *resumes], folder)
         if restarted.code:
-            wrong.append(f"the next run ({' '.join(resumes) or 'as before'}) ends with {restarted.code}: {restarted.said}")
+            wrong.append(
+                f"the next run ({' '.join(resumes) or 'as before'}) ends with {restarted.code}: {restarted.said}"
+            )
         elif found := unlike(folder / verb.output, reference / verb.output):
             wrong.append(f"the next run ({' '.join(resumes) or 'as before'}) makes another result: {found}")
         wrong += self._inputs_changed(folder, verb)
