@@ -295,7 +295,8 @@ def _after_the_signal(case: Case, folder: Path, made: Path, older: Path | None, 
     complete = (output / "run.json").is_file()
     if complete and not _holds(output, made) and not (older is not None and _holds(output, older)):
         yield f"half of a result looks complete: {unlike(output, made)}"
-    if not complete and not verb.in_place and output.is_dir() and (made / "run.json").is_file():
+    tried = output.is_dir() and not any(output.iterdir())  # whether a folder can stand there is tried before the work
+    if not complete and not verb.in_place and output.is_dir() and not tried and (made / "run.json").is_file():
         yield f"{verb.output} is there without run.json"
     if not (made / "run.json").is_file() and output.is_dir():  # single files
         for path in sorted(files(output)):
