@@ -37,7 +37,7 @@ class Cover:
         the module, and by the test files that name it."""
         lines = self.lines.get(str(path.relative_to(ROOT)), {})
         found: set[str] = set().union(*(lines.get(n, set()) for n in range(first, last + 1)))
-        if not found and _at_import(path, first):
+        if _at_import(path, first):  # and some of them by a test that was the first to import the module
             found = set().union(*lines.values()) | {t for t in self.seconds if _names(ROOT / t.split("::")[0], path)}
         return sorted(found, key=lambda t: (self.seconds[t], t))
 
