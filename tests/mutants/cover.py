@@ -138,7 +138,7 @@ class _Contexts:
             self._cover.switch_context("")
 
     @pytest.hookimpl(wrapper=True)
-    def pytest_fixture_setup(self, fixturedef: Any, request: Any) -> Iterator[Any]:
+    def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[Any]:
         if fixturedef.scope == "function":
             return (yield)
         name, begun = f"fixture {fixturedef.argname}", time.process_time()
@@ -147,7 +147,6 @@ class _Contexts:
             return (yield)
         finally:
             self._shared[name] = self._shared.get(name, 0.0) + time.process_time() - begun
-            self._cover.switch_context(request.node.nodeid if hasattr(request, "node") else "")
             self._cover.switch_context(next(reversed(self._uses)))
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
