@@ -39,8 +39,8 @@ coverage: setup
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n auto --maxprocesses 8 --cov --cov-append \
 		--cov-report=term:skip-covered $(LOOPS)
 
-# Small faults planted in the numeric modules, and which of them the tests find (docs/mutants.md). About an hour and a
-# half on one core for 300; what is already there is kept.
+# Small faults planted in the numeric modules, and which of them the tests find (docs/mutants.md). About a quarter of
+# an hour on one core for 300; what is already there is kept.
 SEED ?= 1
 COUNT ?= 300
 mutants: setup

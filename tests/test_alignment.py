@@ -251,3 +251,7 @@ def test_a_keyframe_exactly_at_a_limit_is_trusted_and_beyond_it_is_not():
     ):
         assert align("1", pairs, AlignmentConfig(**{name: value})).ok, name
         assert not align("1", pairs, AlignmentConfig(**{name: beyond})).ok, name
+
+
+def test_where_all_points_agree_there_is_no_rival_scale():
+    assert second_mode(observed(noise=0.0), 0.3, 0.1) == (1.0, 0.0, 1.0)

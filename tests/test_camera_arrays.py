@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from raising import refused
 
-from lightdepth.camera import Scaramuzza, camera_from_params
+from lightdepth.camera import Brown, FullBrown, Pinhole, Scaramuzza, camera_from_params
 from lightdepth.camera.arrays import (
     angle_from_axis,
     at_radius,
@@ -151,3 +152,43 @@ def test_a_scaramuzza_lens_that_never_bends_back_ends_at_a_right_angle_and_one_t
     assert np.degrees(turning.max_theta()) == pytest.approx(45, abs=0.01)
     rays, valid = turning.unproject(np.array([[200 + 199.0, 150], [200 + 201.0, 150], [200, 150]]))
     assert valid.tolist() == [True, False, True] and rays[2].tolist() == [0, 0, 1]
+
+
+def test_an_image_ends_with_its_last_pixel_s_far_corner():
+    camera = Pinhole(8, 6, 2.0, 0.5, 4.0, 3.0)
+    corners = np.array([[0.0, 0], [8, 0], [0, 6], [8, 6]])
+    beside = corners + np.array([[-0.01, 0], [0.01, 0], [0, 0.01], [0.01, 0.01]])
+    for pixels, inside in ((corners, True), (beside, False), (corners[:1] - (0, 0.01), False)):
+        rays = np.concatenate([(pixels - (4, 3)) / (2, 0.5), np.ones((len(pixels), 1))], 1)
+        found, seen = camera.project(rays)
+        np.testing.assert_allclose(found, pixels)
+        assert (seen == inside).all()
+
+
+def test_the_numbers_that_a_model_wants_are_named_where_it_is_one_of_ours():
+    for model, cure in (("PINHOLE", "expected 4: fx fy cx cy"), ("OPENCV", "expected 8: fx fy cx cy k1 k2 p1 p2")):
+        with refused(cure=cure):
+            camera_from_params(model, 9, 9, [1.0])
+    with refused(cure="expected 3") as raised:
+        camera_from_params("SIMPLE_PINHOLE", 9, 9, [1.0])
+    assert "fx" not in raised.value.cure
+    with refused(where="camera size"):
+        Scaramuzza(0, 300, 200.0, 150.0, 100.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("terms", [(-0.5, 0.12, 0.02, -0.015), (0.0, 0.0, 0.15, 0.1), (-0.1, 0.05, -0.2, 0.0)])
+def test_brown_ends_where_its_jacobian_is_first_singular_in_any_direction(terms):
+    k1, k2, p1, p2 = terms
+    angle = np.linspace(0, 2 * np.pi, 721)[:, None]
+    r = np.linspace(0, 3, 6001)[None]
+    x, y = r * np.cos(angle), r * np.sin(angle)
+    radial, slope = 1 + k1 * r**2 + k2 * r**4, 2 * k1 + 4 * k2 * r**2
+    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    first = r[0, ((xx * yy - xy * xy) <= 0).any(0).argmax()]
+    assert 0.1 < first < 2.9
+    camera = Brown(640, 480, 400.0, 408.0, 328.0, 236.8, *terms)
+    assert camera._max_radius() == pytest.approx(first, abs=2e-3)
+    longer = FullBrown(640, 480, 400.0, 408.0, 328.0, 236.8, *terms, 0.0, 0.0, 0.0, 0.0)
+    assert longer._max_radius() == pytest.approx(first, abs=2e-3)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from raising import refused
+from test_losses import LAMBERT, spoilt, tube_batch
 
 from lightdepth.losses import (
     LossConfig,
@@ -15,6 +19,7 @@ from lightdepth.losses import (
     photometric_loss,
     rendered_log_brightness,
     saturated_loss,
+    self_supervised_loss,
     smoothness_loss,
     specular_loss,
     supervised_loss,
@@ -134,3 +139,13 @@ def test_rendered_brightness_is_the_light_with_a_share_of_its_mean_by_the_respon
     lit = irradiance(distance, NORMALS, RAYS, LIGHT, 0.7, 0.05) + indirect
     mean = torch.tensor([v[m].mean() for v, m in zip(lit, MASK, strict=True)]).reshape(2, 1, 1, 1)
     torch.testing.assert_close(found, (lit + ambient * mean).log() / 1.8)
+
+
+def test_structure_is_compared_in_log_space_too_where_it_has_a_weight():
+    batch, albedo = tube_batch()
+    _, terms = self_supervised_loss(spoilt(batch.true_distance), albedo, batch, replace(LAMBERT, ssim=0.7))
+    assert float(terms["ssim"]) > 1e-4
+    with refused(where="loss"):
+        self_supervised_loss(batch.true_distance, None, batch, replace(LAMBERT, ssim=0.1))
+    with refused(where="loss"):
+        self_supervised_loss(batch.true_distance, None, batch, replace(LAMBERT, space="linear"))

@@ -114,3 +114,23 @@ def test_a_pixel_is_as_fine_as_the_focal_length_asks_for_and_no_finer():
     for focal, count in ((31.0, 96), (30.0, 96), (29.8, 96), (29.0, 24), (15.0, 24), (14.0, 12), (7.0, 6)):
         view = surface_view(predicted(distance, camera=camera), image, RectifyConfig(focal_px=focal))
         assert len(view.weights) == count + 1 == view.table.outside + 1
+
+
+def test_a_merged_square_is_an_edge_where_its_own_pixels_differ_by_more_than_the_slope_allows():
+    """Ten per radian over half of 2 / 30 is the largest deviation of the logarithm: a step of 1.9 is not more than
+    that, and one of 2.0 is; to the squares beside it either is a slope."""
+    camera = Pinhole(12, 4, 30.0, 30.0, 6.0, 2.0)
+    image = np.full((4, 12, 3), 0.5, np.float32)
+    for step, left_out in ((1.9, False), (2.0, True)):
+        distance = 3 / camera.rays()[0][..., 2]
+        distance[:, 7:] *= step  # inside the squares of columns 6 and 7
+        weights = surface_view(predicted(distance, camera=camera), image, RectifyConfig(focal_px=15.0)).weights
+        assert ((weights[:-1].reshape(2, 6) == 0) == [False, False, False, left_out, False, False]).all()
+
+
+def test_colours_end_at_black_and_at_white():
+    image = np.full((8, 12, 3), 0.5, np.float32)
+    image[0, 0], image[0, 1], image[0, 2] = -0.3, 1.4, 0.001
+    camera = Pinhole(12, 8, 30.0, 30.0, 6.0, 4.0)
+    view = surface_view(predicted(3 / camera.rays()[0][..., 2], camera=camera), image, RectifyConfig())
+    assert view.colors[:4, 0].tolist() == [0, 255, 0, 128]

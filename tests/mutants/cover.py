@@ -37,7 +37,7 @@ class Cover:
         the module, and by the test files that name it."""
         lines = self.lines.get(str(path.relative_to(ROOT)), {})
         found: set[str] = set().union(*(lines.get(n, set()) for n in range(first, last + 1)))
-        if not found and _at_import(path, first):
+        if _at_import(path, first):  # and some of them by a test that was the first to import the module
             found = set().union(*lines.values()) | {t for t in self.seconds if _names(ROOT / t.split("::")[0], path)}
         return sorted(found, key=lambda t: (self.seconds[t], t))
 
@@ -138,7 +138,7 @@ class _Contexts:
             self._cover.switch_context("")
 
     @pytest.hookimpl(wrapper=True)
-    def pytest_fixture_setup(self, fixturedef: Any, request: Any) -> Iterator[Any]:
+    def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[Any]:
         if fixturedef.scope == "function":
             return (yield)
         name, begun = f"fixture {fixturedef.argname}", time.process_time()
@@ -147,7 +147,6 @@ class _Contexts:
             return (yield)
         finally:
             self._shared[name] = self._shared.get(name, 0.0) + time.process_time() - begun
-            self._cover.switch_context(request.node.nodeid if hasattr(request, "node") else "")
             self._cover.switch_context(next(reversed(self._uses)))
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:

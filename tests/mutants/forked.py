@@ -6,6 +6,7 @@ import ctypes
 import gc
 import importlib
 import importlib.util
+import json
 import os
 import resource
 import select
@@ -88,8 +89,6 @@ def _imported(files: Iterable[Path]) -> list[str]:
 
 def forked_value(function: Callable[[], Any]) -> Any:
     """What a function gives in a process of its own."""
-    import json
-
     with tempfile.NamedTemporaryFile("r+", encoding="utf-8") as file:
         pid = os.fork()
         if not pid:
