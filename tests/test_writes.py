@@ -24,8 +24,10 @@ _RUN = "it is given the run, or its folder in the making"
 ALLOWED = {
     "lightdepth/commands/convert_camera.py: convert_camera": "each format's writer uses write_whole",
     "lightdepth/commands/import_frames.py: import_frames": _RUN,
+    "lightdepth/commands/predict.py: _written": _RUN,
     "lightdepth/exporting/example.py: main": "an example that is exported, and that users run by themselves",
     "lightdepth/prediction.py: save": "predict gives it the run's folder",
+    "lightdepth/reporting/batches.py: finish": _HIDDEN,
     "lightdepth/reporting/report.py: write": "verbs give it the run's folder, or write_together",
     "lightdepth/sfm/features.py: _match": _HIDDEN,
     "lightdepth/sfm/mapping.py: mapped": _HIDDEN,

@@ -25,6 +25,7 @@ from lightdepth.files.machine import machine_failure
 from lightdepth.files.replacing import (
     BEGUN,
     PARTS,
+    STATE,
     check_apart,
     check_replaceable,
     discard,
@@ -84,6 +85,16 @@ class Run:
         self._told: set[str] = set()  # finished parts whose reports are in the record
         self._mark = (0, 0)
         self._verb, self._arguments, self._start = verb, plain(arguments), time.time()
+
+    @property
+    def resumable(self) -> bool:
+        """Whether finished parts are kept when the run is stopped."""
+        return self.parts is not None
+
+    @property
+    def state(self) -> Path:
+        """A folder for files of parts that only a run that is resumed reads: it is gone from the finished run."""
+        return self.folder / STATE
 
     def done(self, part: str) -> bool:
         """Whether a part was finished before: its files are there, and its failures and warnings are in the record
@@ -147,9 +158,20 @@ class Run:
                     "path": str(path),
                     "sha256": input_hash(path, self.output),
                 }
+        self._note_inputs(self.record.get("inputs", {}))
+
+    def check_inputs(self, **paths: Path | None) -> None:
+        """As hash_inputs, for a verb that does not tell the names of files: run.json says nothing of them."""
+        given = {name: path for name, path in paths.items() if path is not None and self.parts is not None}
+        self._note_inputs(
+            # No name of an argument: the arguments of such a verb have no paths.
+            {f"the {n}": {"path": str(p), "sha256": input_hash(p, self.output)} for n, p in given.items()}
+        )
+
+    def _note_inputs(self, inputs: Mapping[str, Any]) -> None:
+        """A run that is resumed compares them."""
         if self.parts is not None and not self.resumed:
-            arguments = compared(self._arguments)
-            begin(self.folder, {"verb": self._verb, "arguments": arguments, "inputs": self.record.get("inputs", {})})
+            begin(self.folder, {"verb": self._verb, "arguments": compared(self._arguments), "inputs": inputs})
 
     @contextmanager
     def hearing(self) -> Iterator[None]:
@@ -165,7 +187,8 @@ class Run:
             line: str | None = None,
         ) -> None:
             shown(message, category, filename, lineno, file, line)
-            if issubclass(category, UserWarning):  # a library's deprecations are no news to a user
+            # A library's deprecations are no news to a user; what a process that was killed heard is heard again.
+            if issubclass(category, UserWarning) and str(message) not in self.record["warnings"]:
                 self.record["warnings"].append(str(message))
                 self._note(f"warning: {message}")
 
@@ -178,6 +201,7 @@ class Run:
     def finish(self) -> None:
         import yaml
 
+        discard(self.state)
         (self.folder / "config.yaml").write_text(yaml.safe_dump(self._arguments, sort_keys=False), encoding="utf-8")
         sync_below(self.folder)  # run.json says that the rest is whole: it comes last
         write_run_json(self.folder, self._verb, self._arguments, self._start, self.record)

@@ -1,0 +1,115 @@
+"""Verbs that are stopped and resumed: no finished part is made again, and the end is that of a run nothing stopped."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from same_results import differences
+from verbs import by_options
+from videos import CAMERA, picture
+
+from lightdepth.commands.import_frames import import_frames as import_frames_verb
+from lightdepth.commands.predict import predict as predict_verb
+from lightdepth.datasets import write_folder
+from lightdepth.errors import PartialFailure
+from lightdepth.frame import Frame
+from lightdepth.models import DeclineModel
+from lightdepth.reporting import batches
+from lightdepth.reporting.run import Run
+
+predict, import_frames = by_options(predict_verb), by_options(import_frames_verb)
+
+
+class Stopped(BaseException):
+    """As a signal stops a run."""
+
+
+@pytest.fixture
+def each_alone(monkeypatch):
+    """Every frame is a part, and every run warns as if it were a process of its own."""
+    monkeypatch.setattr(batches, "SECONDS", 0.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        yield
+
+
+@pytest.fixture
+def stopping(monkeypatch) -> Callable[[int | None], list[str]]:
+    """Called with a number, lets the run stop after so many parts; the list that it gives back holds their names."""
+    finished: list[str] = []
+    left = [None]
+    real = Run.finish_part
+
+    def finish_part(run: Run, part: str, *given, **named) -> None:
+        real(run, part, *given, **named)
+        finished.append(part)
+        if left[0] is not None:
+            left[0] -= 1
+            if not left[0]:
+                raise Stopped
+
+    def after(parts: int | None) -> list[str]:
+        left[0] = parts
+        return finished
+
+    monkeypatch.setattr(Run, "finish_part", finish_part)
+    return after
+
+
+def stopped_everywhere(verb: Callable[..., None], tmp_path: Path, stopping, every: int = 1) -> list[str]:
+    """Stops a verb after each so many parts until it is through, and compares; the names of all parts."""
+    finished = stopping(None)
+    verb(tmp_path / "whole")
+    parts = list(finished)
+    finished.clear()
+    for attempt in itertools.count():
+        stopping(every)
+        try:
+            verb(tmp_path / "out", resume=attempt > 0)
+        except Stopped:
+            continue
+        break
+    assert sorted(finished) == sorted(parts) and attempt == len(parts) // every
+    assert list(differences(tmp_path / "whole", tmp_path / "out")) == []
+    stopping(None)
+    verb(tmp_path / "other", resume=True)  # where there is nothing to resume
+    assert list(differences(tmp_path / "whole", tmp_path / "other")) == []
+    return parts
+
+
+@pytest.fixture(scope="session")
+def few_frames(tmp_path_factory) -> Path:
+    """Frames of a colon, of which one cannot be read."""
+    folder = tmp_path_factory.mktemp("few") / "data"
+    write_folder([Frame(f"{n:06d}", picture(n) / 255.0, CAMERA, time=n / 10) for n in range(5)], folder)
+    torn = next(p for p in sorted(folder.rglob("*.png")) if p.stem == "000002")
+    torn.write_bytes(torn.read_bytes()[:300])
+    return folder
+
+
+def test_predict_goes_on_behind_the_last_finished_frame(few_frames, tmp_path, stopping, each_alone, monkeypatch):
+    seen = []
+    real = DeclineModel.__call__
+    monkeypatch.setattr(DeclineModel, "__call__", lambda model, frame: seen.append(frame.name) or real(model, frame))
+
+    def verb(output: Path, **given) -> None:
+        with suppress(PartialFailure):
+            predict(few_frames, output, checkpoint="decline", **given)
+
+    parts = stopped_everywhere(verb, tmp_path, stopping)
+    assert len(parts) == 5
+    assert seen == [f"{n:06d}" for n in (0, 1, 3, 4)] * 3  # whole, stopped and resumed, other
+
+
+def test_import_goes_on_with_the_measures_and_pictures_that_it_has(few_frames, tmp_path, stopping, each_alone):
+    def verb(output: Path, **given) -> None:
+        import_frames(few_frames, output, every=1, **given)
+
+    parts = stopped_everywhere(verb, tmp_path, stopping, every=3)
+    assert [p for p in parts if p.startswith("measures")] == [f"measures from {n}" for n in range(5)]
+    assert len([p for p in parts if p.startswith("pictures")]) >= 3
