@@ -9,10 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from colons import colon, slam
 from same_results import differences
 from verbs import by_options
 from videos import CAMERA, picture
 
+import densify.commands.densify
+import densify.densified
 from lightdepth.commands.import_frames import import_frames as import_frames_verb
 from lightdepth.commands.predict import predict as predict_verb
 from lightdepth.datasets import write_folder
@@ -21,8 +24,10 @@ from lightdepth.frame import Frame
 from lightdepth.models import DeclineModel
 from lightdepth.reporting import batches
 from lightdepth.reporting.run import Run
+from lightdepth.tube.export import write_synthetic
 
 predict, import_frames = by_options(predict_verb), by_options(import_frames_verb)
+densify_verb = by_options(densify.commands.densify.densify)
 
 
 class Stopped(BaseException):
@@ -61,7 +66,9 @@ def stopping(monkeypatch) -> Callable[[int | None], list[str]]:
     return after
 
 
-def stopped_everywhere(verb: Callable[..., None], tmp_path: Path, stopping, every: int = 1) -> list[str]:
+def stopped_everywhere(
+    verb: Callable[..., None], tmp_path: Path, stopping, every: int = 1, anew: bool = True
+) -> list[str]:
     """Stops a verb after each so many parts until it is through, and compares; the names of all parts."""
     finished = stopping(None)
     verb(tmp_path / "whole")
@@ -76,9 +83,11 @@ def stopped_everywhere(verb: Callable[..., None], tmp_path: Path, stopping, ever
         break
     assert sorted(finished) == sorted(parts) and attempt == len(parts) // every
     assert list(differences(tmp_path / "whole", tmp_path / "out")) == []
-    stopping(None)
-    verb(tmp_path / "other", resume=True)  # where there is nothing to resume
-    assert list(differences(tmp_path / "whole", tmp_path / "other")) == []
+    assert not (tmp_path / "out" / ".state").exists()
+    if anew:  # there is nothing to resume
+        stopping(None)
+        verb(tmp_path / "other", resume=True)
+        assert list(differences(tmp_path / "whole", tmp_path / "other")) == []
     return parts
 
 
@@ -113,3 +122,21 @@ def test_import_goes_on_with_the_measures_and_pictures_that_it_has(few_frames, t
     parts = stopped_everywhere(verb, tmp_path, stopping, every=3)
     assert [p for p in parts if p.startswith("measures")] == [f"measures from {n}" for n in range(5)]
     assert len([p for p in parts if p.startswith("pictures")]) >= 3
+
+
+def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(tmp_path, stopping, each_alone, monkeypatch):
+    """Two submaps that meet, so that what is read back is joined, judged and written, pictures too."""
+    frames = colon(0).frames
+    write_synthetic(frames, slam(frames, maps=2, shared_keyframes=3), tmp_path / "data")
+    (tmp_path / "data" / "light.json").unlink()
+    done = []
+    real = densify.densified.densify_or_empty
+    monkeypatch.setattr(
+        densify.densified, "densify_or_empty", lambda submap, *given: done.append(submap.id) or real(submap, *given)
+    )
+
+    def verb(output: Path, **given) -> None:
+        densify_verb(tmp_path / "data", output, map=tmp_path / "data" / "slam", checkpoint="decline", **given)
+
+    parts = stopped_everywhere(verb, tmp_path, stopping, anew=False)
+    assert parts == ["light", "map 0", "map 1", "joined"] and done == [0, 1, 0, 1]

@@ -31,6 +31,7 @@ def densify(
     merge: bool = True,
     merging: MergeConfig = MergeConfig(),
     overwrite: bool = False,
+    resume: bool = False,
 ) -> None:
     """Dense surfaces from frames and a sparse map, one per submap, and one more for submaps that meet.
 
@@ -50,6 +51,8 @@ def densify(
             switched off, submaps stay apart.
         merging: when two submaps are one
         overwrite: Replace a run made before.
+        resume: Go on with the run that was stopped there, as it was begun; a sparse map, a light and submaps that are
+            done are not made again.
     """
     if "ply" not in formats:
         raise InputError("--formats", f"{list(formats)}", "expected ply, and besides it glb and obj if wanted")
@@ -68,12 +71,12 @@ def densify(
         merge=merge,
         merging=merging,
     )
-    with run_folder(output, "densify", arguments, overwrite) as run:
+    with run_folder(output, "densify", arguments, overwrite, resume) as run:
+        run.hash_inputs(**source.files, map=mapped.map, checkpoint=Path(checkpoint))
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
-        run.hash_inputs(**source.files, map=mapped.map)
         doubts = doubts_of_inputs(run, sparse_map, frames)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
-        work = Densified.make(frames, sparse_map, model, config, merging if merge else None)
+        work = Densified.make(frames, sparse_map, model, config, merging if merge else None, run)
         work.doubts = doubts
         work.write(run, formats, mm_per_unit)
         proposals = {} if mapped.map is None or mapped.repair_map else work.proposals()

@@ -64,9 +64,8 @@ def predict(
     if refine:
         model = RefinedModel(model, RefineConfig(steps=refine))
     with run_folder(output, "predict", arguments, overwrite, resume) as run:
+        run.hash_inputs(**source.files, checkpoint=Path(checkpoint), uncertainty=uncertainty)
         frames = open_frames(source, run).without_truth()
-        weights = Path(checkpoint) if Path(checkpoint).is_file() else None
-        run.hash_inputs(**source.files, checkpoint=weights, uncertainty=uncertainty)
         if previews:
             (run.folder / "previews").mkdir(exist_ok=True)
         nothing, meter = 0, ColourMeter()

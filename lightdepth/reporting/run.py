@@ -151,22 +151,22 @@ class Run:
         self.log(f"warning: {message}")
 
     def hash_inputs(self, **paths: Path | None) -> None:
-        """Notes what files and folders were read, by name; None is one that was not given."""
-        for name, path in paths.items():
-            if path is not None:
-                self.record.setdefault("inputs", {})[name] = {
-                    "path": str(path),
-                    "sha256": input_hash(path, self.output),
-                }
-        self._note_inputs(self.record.get("inputs", {}))
+        """Notes what files and folders are read, by name; those that are None, or not there, are left out."""
+        self.record.setdefault("inputs", {}).update(self._hashed(paths))
+        self._note_inputs(self.record["inputs"])
 
     def check_inputs(self, **paths: Path | None) -> None:
         """As hash_inputs, for a verb that does not tell the names of files: run.json says nothing of them."""
-        given = {name: path for name, path in paths.items() if path is not None and self.parts is not None}
-        self._note_inputs(
-            # No name of an argument: the arguments of such a verb have no paths.
-            {f"the {n}": {"path": str(p), "sha256": input_hash(p, self.output)} for n, p in given.items()}
-        )
+        # By no name of an argument: the arguments of such a verb have no paths.
+        self._note_inputs(self._hashed({f"the {name}": path for name, path in paths.items()}))
+
+    def _hashed(self, paths: Mapping[str, Path | None]) -> dict[str, dict[str, str]]:
+        found = {}
+        for name, path in paths.items():
+            with suppress(OSError):  # whoever reads it says what is wrong with it
+                if path is not None and path.exists():
+                    found[name] = {"path": str(path), "sha256": input_hash(path, self.output)}
+        return found
 
     def _note_inputs(self, inputs: Mapping[str, Any]) -> None:
         """A run that is resumed compares them."""
