@@ -15,11 +15,12 @@ from densify.judging.verdict import Verdict, doubted, proposal, worst
 from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify_or_empty
 from densify.predictions import SeenKeyframe
-from densify.resuming import kept, kept_result
+from densify.resuming import kept_result
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.hidden_uncertainty import FILE
 from lightdepth.models import DepthModel
+from lightdepth.reporting.kept import kept
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sparse_map import SparseMap, Submap

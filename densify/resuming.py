@@ -1,20 +1,17 @@
-"""The steps of a densify run that are finished parts: what each gave is kept, and read back when the run is resumed."""
+"""Submaps of a densify run as finished parts: what each gave is kept, and read back when the run is resumed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
 from densify.page import Gallery
 from densify.pipeline import SubmapResult
-from lightdepth.files.packed import read_packed, write_packed
+from lightdepth.reporting.kept import kept
 from lightdepth.reporting.run import Run
 from lightdepth.sparse_map import Submap
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -24,19 +21,6 @@ class _Shown:
     result: SubmapResult
     pictures: tuple[np.ndarray, ...]
     captions: tuple[str, ...]
-
-
-def kept(run: Run, part: str, kind: type[T], make: Callable[[], T], given: Mapping[type, object] | None = None) -> T:
-    """What `make` gives, or gave before the run was stopped. `given` as for read_packed."""
-    file = run.state / f"{part}.npz"
-    if run.done(part):
-        return read_packed(file, kind, given)
-    made = make()
-    if run.resumable:
-        file.parent.mkdir(exist_ok=True)
-        write_packed(file, made, given)
-        run.finish_part(part, [file])
-    return made
 
 
 def kept_result(run: Run, submap: Submap, gallery: Gallery, make: Callable[[], SubmapResult]) -> SubmapResult:

@@ -11,11 +11,14 @@ from pathlib import Path
 import pytest
 from colons import colon, slam
 from same_results import differences
+from test_sfm import PINHOLE, film
 from verbs import by_options
 from videos import CAMERA, picture
 
 import densify.commands.densify
 import densify.densified
+from densify.commands.sparse import sparse as sparse_verb
+from densify.fusion.volume import FusionConfig
 from lightdepth.commands.import_frames import import_frames as import_frames_verb
 from lightdepth.commands.predict import predict as predict_verb
 from lightdepth.datasets import write_folder
@@ -24,9 +27,12 @@ from lightdepth.frame import Frame
 from lightdepth.models import DeclineModel
 from lightdepth.reporting import batches
 from lightdepth.reporting.run import Run
+from lightdepth.sfm import keeping
+from lightdepth.sfm.config import SfmConfig
 from lightdepth.tube.export import write_synthetic
 
 predict, import_frames = by_options(predict_verb), by_options(import_frames_verb)
+sparse = by_options(sparse_verb)
 densify_verb = by_options(densify.commands.densify.densify)
 
 
@@ -124,19 +130,34 @@ def test_import_goes_on_with_the_measures_and_pictures_that_it_has(few_frames, t
     assert len([p for p in parts if p.startswith("pictures")]) >= 3
 
 
-def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(tmp_path, stopping, each_alone, monkeypatch):
+@pytest.mark.parametrize("every", [2, pytest.param(1, marks=pytest.mark.slow)])
+def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(tmp_path, stopping, each_alone, monkeypatch, every):
     """Two submaps that meet, so that what is read back is joined, judged and written, pictures too."""
-    frames = colon(0).frames
-    write_synthetic(frames, slam(frames, maps=2, shared_keyframes=3), tmp_path / "data")
+    frames = colon(0).frames[:6]
+    write_synthetic(frames, slam(frames, maps=2, shared_keyframes=2), tmp_path / "data")
     (tmp_path / "data" / "light.json").unlink()
-    done = []
+    done, coarse = [], FusionConfig(voxels_per_distance=20.0)
     real = densify.densified.densify_or_empty
     monkeypatch.setattr(
         densify.densified, "densify_or_empty", lambda submap, *given: done.append(submap.id) or real(submap, *given)
     )
 
     def verb(output: Path, **given) -> None:
-        densify_verb(tmp_path / "data", output, map=tmp_path / "data" / "slam", checkpoint="decline", **given)
+        densify_verb(
+            tmp_path / "data", output, map=tmp_path / "data" / "slam", checkpoint="decline", fusion=coarse, **given
+        )
+
+    parts = stopped_everywhere(verb, tmp_path, stopping, every, anew=False)
+    assert parts == ["light", "map 0", "map 1", "joined"] and done == [0, 1, 0, 1]
+
+
+@pytest.mark.slow
+def test_sparse_goes_on_with_the_features_and_matches_that_it_has(tmp_path, stopping, each_alone, monkeypatch):
+    monkeypatch.setattr(keeping, "SECONDS", 0.0)
+    write_folder(film(PINHOLE, 9), tmp_path / "data")
+
+    def verb(output: Path, **given) -> None:
+        sparse(tmp_path / "data", output, sfm=SfmConfig(max_features=1000), **given)
 
     parts = stopped_everywhere(verb, tmp_path, stopping, anew=False)
-    assert parts == ["light", "map 0", "map 1", "joined"] and done == [0, 1, 0, 1]
+    assert parts == ["matching"] * 4 + ["sparse map"]

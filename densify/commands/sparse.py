@@ -33,6 +33,7 @@ def sparse(
     sfm: SfmConfig = SfmConfig(),
     reading: Group[MapReading] = MapReading(),
     overwrite: bool = False,
+    resume: bool = False,
 ) -> None:
     """A sparse map by pycolmap, where there is no SLAM output or a poor one.
 
@@ -54,6 +55,8 @@ def sparse(
             and keeping its frame and scale; not with --poses. Left out, the map is made of all frames.
         sfm: how frames are mapped
         overwrite: Replace a folder made before.
+        resume: Go on with the run that was stopped there, as it was begun; features and matches that are done, up to
+            the last minute, are not made again.
     """
     if repair is not None and poses is not None:
         raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
@@ -71,8 +74,8 @@ def sparse(
         repair=repair,
         sfm=sfm,
     )
-    with run_folder(output, "sparse", arguments, overwrite) as run:
-        run.hash_inputs(data=data, repair=repair)
+    with run_folder(output, "sparse", arguments, overwrite, resume) as run:
+        run.hash_inputs(**source.files, repair=repair, poses=None if poses in (None, "truth") else Path(poses))
         if repair is not None:
             map_and_frames(run, source, MapSource.read_as(repair, reading, repair_map=True), sfm)
             return

@@ -83,7 +83,7 @@ class Run:
         self.parts = None if parts is None else dict(parts)
         self.resumed = bool(parts)
         self._told: set[str] = set()  # finished parts whose reports are in the record
-        self._mark = (0, 0)
+        self._begun: dict[str, tuple[int, int]] = {}  # failures and warnings when a part began: parts may lie in parts
         self._verb, self._arguments, self._start = verb, plain(arguments), time.time()
 
     @property
@@ -101,7 +101,7 @@ class Run:
         now, where they would be had it run. Else it begins here: what is reported from now on is its own."""
         found = (self.parts or {}).get(part)
         if found is None:
-            self._mark = (len(self.record["failures"]), len(self.record["warnings"]))
+            self._begun[part] = (len(self.record["failures"]), len(self.record["warnings"]))
             return False
         if part not in self._told:
             self._told.add(part)
@@ -121,7 +121,7 @@ class Run:
             sizes = new_files(self.folder, (name for each in self.parts.values() for name in each.files))
         else:
             sizes = {str(file.relative_to(self.folder)): file.stat().st_size for file in files}
-        failures, warned = self._mark
+        failures, warned = self._begun.get(part, (0, 0))
         made = Part(part, sizes, self.record["failures"][failures:], self.record["warnings"][warned:], plain(kept))
         add_part(self.folder, made, [self.folder / name for name in sizes])
         self.parts[part] = made
