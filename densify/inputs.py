@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 from densify.config import MethodConfig
 from densify.placing import Placing
@@ -30,6 +31,22 @@ from lightdepth.sfm.made import made_sparse
 from lightdepth.sfm.repair import Repair, repaired_submap
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 from lightdepth.uncalibrated import check_camera_asked, open_frames
+
+
+@dataclass(frozen=True)
+class SurfaceFiles:
+    """How surfaces are written."""
+
+    formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply",)
+    """Formats of the mesh files to write: ply, which must be among them, and besides it glb and obj if wanted."""
+    mm_per_unit: float | None = None
+    """Millimetres per map unit, where known: lengths and surfaces are then written in mm, else in map units. It is one
+    factor for all submaps, right for those that share a unit. A larger one makes a larger surface."""
+
+    def __post_init__(self) -> None:
+        if "ply" not in self.formats:
+            raise InputError("--formats", f"{list(self.formats)}", "expected ply, and besides it glb and obj if wanted")
+        check_unit(self.mm_per_unit)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ ALLOWED = {
     "lightdepth/commands/predict.py: _written": _RUN,
     "lightdepth/exporting/example.py: main": "an example that is exported, and that users run by themselves",
     "lightdepth/files/packed.py: write_packed": _RUN,
+    "lightdepth/reporting/kept.py: kept": _RUN,
     "lightdepth/sfm/keeping.py: _copied": "a database in the run folder in the making",
     "lightdepth/prediction.py: save": "predict gives it the run's folder",
     "lightdepth/reporting/batches.py: finish": _HIDDEN,
@@ -48,6 +49,7 @@ ALLOWED = {
     "densify/exporting/work.py: export_maps": _RUN,
     "train/commands/ablate.py: _ablate": "write_table uses write_whole",
     "train/fit.py: __call__": "log.txt of a training, which grows while it lasts",
+    "train/commands/adapt.py: _fit": _RUN,
 }
 """Where a path is not seen to be below a run folder, and why it is whole nevertheless."""
 WRITERS = {"write_text", "write_bytes", "imwrite", "savez", "savez_compressed", "savetxt", "save_file", "tofile"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,23 @@ from lightdepth.sfm.made import made_sparse
 from lightdepth.uncalibrated import open_frames
 
 
+@dataclass(frozen=True)
+class Beginning:
+    """What is known of the frames' poses."""
+
+    poses: str | None = None
+    """Known poses of the frames: truth (those of the sequence), or a TUM file (world from camera) whose times are frame
+    numbers, or seconds where the frames are stamped or --map-fps counts; only points are then found. Left out, poses
+    are found as well."""
+    repair: Path | None = None
+    """Sparse map of the frames to make anew, by matching the images of its keyframes, beginning at its poses and
+    keeping its frame and scale; not with --poses. Left out, the map is made of all frames."""
+
+    def __post_init__(self) -> None:
+        if self.repair is not None and self.poses is not None:
+            raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
+
+
 def sparse(
     data: Path,
     output: Path,
@@ -28,8 +46,7 @@ def sparse(
     fov: float | None = None,
     mask: Path | None = None,
     bit_depth: int | None = None,
-    poses: str | None = None,
-    repair: Path | None = None,
+    begun: Group[Beginning] = Beginning(),
     sfm: SfmConfig = SfmConfig(),
     reading: Group[MapReading] = MapReading(),
     overwrite: bool = False,
@@ -48,21 +65,16 @@ def sparse(
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
             their highest values show. A larger one reads the same numbers as darker.
-        poses: Known poses of the frames: truth (those of the sequence), or a TUM file (world from camera) whose times
-            are frame numbers, or seconds where the frames are stamped or --map-fps counts; only points are then found.
-            Left out, poses are found as well.
-        repair: Sparse map of the frames to make anew, by matching the images of its keyframes, beginning at its poses
-            and keeping its frame and scale; not with --poses. Left out, the map is made of all frames.
         sfm: how frames are mapped
         overwrite: Replace a folder made before.
         resume: Go on with the run that was stopped there, as it was begun; features and matches that are done, up to
             the last minute, are not made again.
     """
-    if repair is not None and poses is not None:
-        raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
+    poses, repair = begun.poses, begun.repair
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth, fov=fov)
     arguments = recorded(
         reading,
+        begun,
         output=output,
         data=data,
         format=format,
@@ -70,8 +82,6 @@ def sparse(
         fov=fov,
         mask=mask,
         bit_depth=bit_depth,
-        poses=poses,
-        repair=repair,
         sfm=sfm,
     )
     with run_folder(output, "sparse", arguments, overwrite, resume) as run:
