@@ -11,6 +11,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from raising import refused
@@ -345,10 +346,16 @@ def test_a_disk_that_fails_is_told_in_a_sentence_and_the_old_result_stays(tmp_pa
     assert text_of(tmp_path / "out") == "old" and left_in(tmp_path) == ["out"]
 
 
-def test_a_folder_that_is_gone_and_memory_that_is_used_up_are_told_whatever_a_library_says(tmp_path):
+def test_a_folder_that_is_gone_and_memory_that_is_used_up_are_told_whatever_a_library_says(tmp_path, monkeypatch):
     with pytest.raises(MachineFailure, match="is gone"), run_folder(tmp_path / "out", "densify", {}) as run:
         run.folder.rename(tmp_path / "elsewhere")
         raise RuntimeError("PytorchStreamWriter failed writing file data/0")
+    with monkeypatch.context() as full:
+        full.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=4096))
+        with pytest.raises(MachineFailure, match="disk is full"), run_folder(tmp_path / "out", "densify", {}):
+            raise ValueError("cannot write")  # as a library says it
+        with pytest.raises(InputError), run_folder(tmp_path / "out", "densify", {}):
+            raise InputError("a", "0", "give 1")
     for error in (MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried ...")):
         with pytest.raises(MachineFailure, match="memory"), run_folder(tmp_path / "out", "densify", {}):
             raise error

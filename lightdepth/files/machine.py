@@ -6,10 +6,11 @@ Python and the libraries say these in many ways; here each becomes one sentence,
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 from pathlib import Path
 
-from lightdepth.errors import MachineFailure
+from lightdepth.errors import InputError, MachineFailure, PartialFailure
 
 FAILS = {
     errno.ENOSPC: "the disk is full",
@@ -28,15 +29,18 @@ FAILS = {
 }
 """What no other input would cure, by the number that the system gives."""
 
-_FULL = 1 << 20
-"""A disk with less room than this, in bytes, when a writer failed: then that is why. Libraries do not always say."""
+_FULL = 1 << 16
+"""A disk with less room than this, in bytes, when a writer failed: then that is why. Libraries do not always say, but
+what they wrote of their file has filled the disk."""
 
 _MEMORY = ("can't allocate memory", "out of memory", "Insufficient memory", "Cannot allocate memory", "bad_alloc")
 
 
-def machine_failure(error: BaseException, folder: Path | None = None, kept: str = "") -> MachineFailure | None:
+def machine_failure(
+    error: BaseException, folder: Path | None = None, kept: str = "", place: Path | None = None
+) -> MachineFailure | None:
     """The failure of the machine that `error` tells of, or None. `folder` is where the work was being written,
-    `kept` a sentence on what is left of it."""
+    hidden, and `place` where it was to come to; `kept` is a sentence on what is left of it."""
     reason = _reason(error, folder)
     if reason is None:
         return None
@@ -44,8 +48,11 @@ def machine_failure(error: BaseException, folder: Path | None = None, kept: str 
     named = None if isinstance(named, int) else named  # a descriptor says nothing to a reader
     if reason == FAILS[errno.ENOMEM]:
         return MachineFailure(". ".join(filter(None, (reason, kept))))
-    where = Path(str(named)) if named is not None else folder
-    said = reason if where is None else f"{_shown(where, folder)}: {reason}{_room(where)}"
+    where = Path(os.fsdecode(named)) if named is not None else folder or place
+    if where is None:
+        return MachineFailure(". ".join(filter(None, (reason, kept))))
+    inside = folder is not None and where.is_relative_to(folder)
+    said = f"{place if inside and place else where}: {reason}{_room(where)}"
     return MachineFailure(". ".join(filter(None, (said, kept))))
 
 
@@ -56,7 +63,7 @@ def _reason(error: BaseException, folder: Path | None) -> str | None:
         return FAILS[errno.ENOMEM]
     if isinstance(error, OSError) and error.errno in FAILS:
         return FAILS[error.errno]
-    if folder is None or not isinstance(error, Exception):
+    if folder is None or isinstance(error, InputError | PartialFailure) or not isinstance(error, Exception):
         return None
     if not folder.is_dir():
         return "the folder that was being written to is gone"
@@ -65,13 +72,6 @@ def _reason(error: BaseException, folder: Path | None) -> str | None:
     except OSError:
         return FAILS[errno.EIO]
     return FAILS[errno.ENOSPC] if full else None
-
-
-def _shown(where: Path, folder: Path | None) -> Path:
-    """The path, without the hidden folder that only we know."""
-    if folder is not None and where.is_relative_to(folder):
-        return folder.parent
-    return where
 
 
 def _room(path: Path) -> str:

@@ -245,7 +245,7 @@ def run_folder(
                 run.finish()
             replace(run.folder, real, before)
     except OSError as error:
-        failure = machine_failure(error)
+        failure = machine_failure(error, place=real)
         if failure is not None:
             raise failure from error
         if run is not None:
@@ -326,7 +326,9 @@ def _kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
     except BaseException as error:
         kept = bool(resumable and run.parts and not isinstance(error, InputError))
         said = f"{len(run.parts or ())} finished part(s) are kept: --resume goes on" if kept else ""
-        failure = machine_failure(error, run.folder, said or f"Nothing of it is kept; {output.name} is as it was")
+        failure = machine_failure(
+            error, run.folder, said or f"Nothing of it is kept; {output.name} is as it was", output
+        )
         if not kept:
             discard(run.folder)
         elif failure is None:
