@@ -28,7 +28,6 @@ ALLOWED = {
     "lightdepth/exporting/example.py: main": "an example that is exported, and that users run by themselves",
     "lightdepth/files/packed.py: write_packed": _RUN,
     "lightdepth/reporting/kept.py: kept": _RUN,
-    "lightdepth/sfm/keeping.py: _copied": "a database in the run folder in the making",
     "lightdepth/prediction.py: save": "predict gives it the run's folder",
     "lightdepth/reporting/batches.py: finish": _HIDDEN,
     "lightdepth/reporting/report.py: write": "verbs give it the run's folder, or write_together",
