@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 import warnings
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -20,6 +21,7 @@ from videos import CAMERA, picture
 
 import densify.commands.densify
 import densify.densified
+import densify.page
 from densify.bench.scenes import Scene
 from densify.commands import bench
 from densify.commands.sparse import sparse as sparse_verb
@@ -145,7 +147,7 @@ def test_import_goes_on_with_the_measures_and_pictures_that_it_has(few_frames, t
     assert len([p for p in parts if p.startswith("pictures")]) >= 3
 
 
-@pytest.mark.parametrize(("every", "judging"), [(3, False), pytest.param(1, True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("every", "judging"), [(2, False), pytest.param(1, True, marks=pytest.mark.slow)])
 def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(
     tmp_path, stopping, each_alone, monkeypatch, every, judging
 ):
@@ -153,6 +155,9 @@ def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(
     frames = colon(0).frames[:6]
     write_synthetic(frames, slam(frames, maps=2, shared_keyframes=2), tmp_path / "data")
     (tmp_path / "data" / "light.json").unlink()
+    # Drawn from the arrays alone, and slowly: their sum tells as well whether they are the same.
+    summed = lambda *of, **_: np.full((1, 1, 3), zlib.crc32(b"".join(a.tobytes() for a in of)) / 2**32)  # noqa: E731
+    monkeypatch.setattr(densify.page, "mesh_picture", summed)
     done, coarse = [], FusionConfig(voxels_per_distance=20.0)
     real = densify.densified.densify_or_empty
     monkeypatch.setattr(
@@ -165,7 +170,7 @@ def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(
         )
 
     parts = stopped_everywhere(verb, tmp_path, stopping, every, anew=False)
-    assert parts == ["light", "map 0", "map 1", "joined"] and done == [0, 1, 0, 1]
+    assert parts == ["light"] * judging + ["map 0", "map 1", "joined"] and done == [0, 1, 0, 1]
 
 
 @pytest.mark.slow
