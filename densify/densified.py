@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
@@ -13,12 +13,14 @@ from densify.joining import MergeConfig, Merged, joined_name, merge
 from densify.judging.doubts import DoubtsCalibrated, calibrated_together
 from densify.judging.verdict import Verdict, doubted, proposal, worst
 from densify.page import Gallery
-from densify.pipeline import SubmapResult, densify
+from densify.pipeline import SubmapResult, densify_or_empty
 from densify.predictions import SeenKeyframe
+from densify.resuming import kept_result
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.hidden_uncertainty import FILE
 from lightdepth.models import DepthModel
+from lightdepth.reporting.kept import kept
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sparse_map import SparseMap, Submap
@@ -43,7 +45,9 @@ class Densified:
         model: DepthModel,
         config: DensifyConfig,
         merging: MergeConfig | None = None,
+        run: Run | None = None,
     ) -> Densified:
+        """With a run that can be resumed, each submap is a finished part of it, and so are the joined ones."""
         gallery = Gallery(sparse_map)
         count = sum(len(s.keyframes) for s in sparse_map.submaps)
         with Progress("Densifying", count) as bar:
@@ -52,11 +56,17 @@ class Densified:
                 gallery(submap, aligned, seen)
                 bar.advance()
 
-            results = densify(frames, sparse_map, model, config, show)
+            def made(submap: Submap) -> SubmapResult:
+                return densify_or_empty(submap, frames, model, config, show)
+
+            results = [
+                made(s) if run is None else kept_result(run, s, gallery, partial(made, s)) for s in sparse_map.submaps
+            ]
         merged = None
         if merging is not None and len(results) > 1:
             with Progress("Joining submaps", count) as bar:
-                merged = merge(results, frames, model, config, merging, lambda *_: bar.advance())
+                join = partial(merge, results, frames, model, config, merging, lambda *_: bar.advance())
+                merged = join() if run is None else kept(run, "joined", Merged, join)
         return cls(model.name, results, gallery, merged)
 
     @property

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Annotated, Literal
 
 from densify.config import MethodConfig
 from densify.placing import Placing
@@ -21,12 +23,31 @@ from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
 from lightdepth.maps.convention import MapReading
 from lightdepth.models import ConstantModel, DepthModel
+from lightdepth.ranges import above
+from lightdepth.reporting.kept import kept
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.keeping import KeptDatabase
 from lightdepth.sfm.made import made_sparse
-from lightdepth.sfm.repair import repaired_submap
-from lightdepth.sparse_map import Keyframe, SparseMap
+from lightdepth.sfm.repair import Repair, repaired_submap
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 from lightdepth.uncalibrated import check_camera_asked, open_frames
+
+
+@dataclass(frozen=True)
+class SurfaceFiles:
+    """How surfaces are written."""
+
+    formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply",)
+    """Formats of the mesh files to write: ply, which must be among them, and besides it glb and obj if wanted."""
+    mm_per_unit: Annotated[float | None, above(0)] = None
+    """Millimetres per map unit, where known: lengths and surfaces are then written in mm, else in map units. It is one
+    factor for all submaps, right for those that share a unit. A larger one makes a larger surface."""
+
+    def __post_init__(self) -> None:
+        if "ply" not in self.formats:
+            raise InputError("--formats", f"{list(self.formats)}", "expected ply, and besides it glb and obj if wanted")
+        check_unit(self.mm_per_unit)
 
 
 @dataclass(frozen=True)
@@ -107,13 +128,33 @@ def repaired(run: Run, sparse_map: SparseMap, frames: FrameSequence, config: Sfm
         seen = [k for k in submap.keyframes if k.number in frames.numbers]
         images = FrameSequence([k.name for k in seen], _ImagesOf(frames, seen), frames.source) if seen else []
         run.log(f"repair of map {submap.id}: {len(seen)} keyframes are matched")
-        new, repair = repaired_submap(submap, images, run.folder / "sparse" / str(submap.id), config)
+        folder, database = run.folder / "sparse" / str(submap.id), KeptDatabase(run, f"matching {submap.id}")
+        make = partial(_Repaired.of, submap, images, folder, config, database)
+        new, repair = kept(run, f"repair {submap.id}", _Repaired, make, folder=folder).both
         worse = repair.left or len(new.keyframes) < len(seen)
         (run.warn if worse else run.log)(f"repair: {repair}")
         submaps.append(new)
         told.append(repair)
     run.record["repair"] = plain(told)
     return replace(sparse_map, submaps=tuple(submaps))
+
+
+@dataclass(frozen=True)
+class _Repaired:
+    """A submap that was made anew, and what that changed."""
+
+    submap: Submap
+    repair: Repair
+
+    @classmethod
+    def of(
+        cls, submap: Submap, images: Sequence[Frame], folder: Path, config: SfmConfig, database: KeptDatabase
+    ) -> _Repaired:
+        return cls(*repaired_submap(submap, images, folder, config, None, database))
+
+    @property
+    def both(self) -> tuple[Submap, Repair]:
+        return self.submap, self.repair
 
 
 def doubts_of_inputs(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> tuple[str, ...]:

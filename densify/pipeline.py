@@ -53,13 +53,21 @@ def densify(
     `on_keyframe` is shown every keyframe as it is done (progress, pictures). A submap that cannot be densified has an
     empty surface, and the reason with every keyframe; the others go on.
     """
-    results = []
-    for submap in sparse_map.submaps:
-        try:
-            results.append(densify_submap(submap, frames, model, config, on_keyframe))
-        except InputError as error:
-            results.append(SubmapResult(DenseMap.empty(submap, str(error))))
-    return results
+    return [densify_or_empty(submap, frames, model, config, on_keyframe) for submap in sparse_map.submaps]
+
+
+def densify_or_empty(
+    submap: Submap,
+    frames: FrameSequence,
+    model: Predictor,
+    config: DensifyConfig = DensifyConfig(),
+    on_keyframe: OnKeyframe | None = None,
+) -> SubmapResult:
+    """The dense map of one submap; where there can be none, an empty one with the reason."""
+    try:
+        return densify_submap(submap, frames, model, config, on_keyframe)
+    except InputError as error:
+        return SubmapResult(DenseMap.empty(submap, str(error)))
 
 
 def densify_submap(

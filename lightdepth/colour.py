@@ -11,8 +11,9 @@ The limits stand where harm begins, measured on synthetic colons (docs/colour.md
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -140,6 +141,29 @@ class ColourMeter:
         if step is not None:
             self._steps.append(step)
         self._before = seen
+
+    def taken(self) -> tuple[int, int]:
+        """How many colours and steps there are by now, for `since`."""
+        return len(self._colours), len(self._steps)
+
+    def since(self, taken: tuple[int, int]) -> dict[str, Any]:
+        """What came after that, as plain values that `go_on` takes."""
+        colours, steps = taken
+        return {"colours": self._colours[colours:], "steps": [astuple(step) for step in self._steps[steps:]]}
+
+    def last(self) -> dict[str, np.ndarray]:
+        """The last frame, with which the next is compared, as arrays that `go_on` takes; empty where there is none."""
+        if self._before is None:
+            return {}
+        return {name: np.asarray(value) for name, value in vars(self._before).items()}
+
+    def go_on(self, since: Mapping[str, Any], last: Mapping[str, np.ndarray]) -> None:
+        """Takes what another meter has seen."""
+        self._colours += [(red, blue) for red, blue in since["colours"]]
+        self._steps += [Step(*step) for step in since["steps"]]
+        self._before = None
+        if last:
+            self._before = Glance(last["log"], last["lit"], last["usable"], float(last["white"]))
 
     def result(self) -> Colours:
         return Colours(np.array(self._colours, np.float64).reshape(-1, 2), tuple(self._steps))

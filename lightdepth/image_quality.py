@@ -13,6 +13,7 @@ pixel a frame.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -173,6 +174,19 @@ class Meter:
         next_row = cv2.absdiff(rows[1:], rows[:-1])
         neighbours = _mean(next_row[:-1], self._rows_of_three) + _mean(next_row[1:], self._rows_of_three)
         return (neighbours + 0.5) / (2 * _mean(cv2.absdiff(rows[2:], rows[:-2]), self._rows_of_three) + 0.5)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def since(self, count: int) -> dict[str, np.ndarray]:
+        """What came after so many frames, as arrays that `go_on` takes."""
+        found = np.array(self._found[count:], np.float64).reshape(-1, 9)
+        return {"measures": found} | ({} if self._before is None else {"before": self._before})
+
+    def go_on(self, since: Mapping[str, np.ndarray]) -> None:
+        """Takes what another meter of the same mask has found."""
+        self._found += since["measures"].tolist()
+        self._before = since.get("before")
 
     def result(self) -> Measures:
         return Measures(*np.array(self._found, np.float64).reshape(-1, 9).T)

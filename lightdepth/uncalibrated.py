@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from lightdepth.calibration import write_camera
 from lightdepth.calibration.json_files import write_found_camera
-from lightdepth.camera import CameraModel
+from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.reading import size_of_frames
 from lightdepth.errors import InputError
@@ -30,6 +30,7 @@ FRAMES = 24
 """Frames that are mapped to find a camera."""
 _SECONDS_APART = 0.2  # an endoscope moves some millimetres in that time
 _PLACES = 0.5, 0.25, 0.75  # of the sequence, where a stretch is looked for
+_PART = "camera"  # of a run that is resumed
 
 
 def open_frames(
@@ -63,7 +64,14 @@ def with_camera(
     """The source with its camera in the run's camera.json, found first where it asks for that; and how it was found."""
     if not source.asks_for_camera:
         return source, None
-    found, file = found_camera(source, run, config), run.folder / "camera.json"
+    if run.done(_PART):
+        found, told = Found.of(run.kept_of(_PART)), run.kept_of(_PART)["told"]
+        run.record |= told
+    else:
+        found = found_camera(source, run, config)
+        told = {name: run.record[name] for name in ("self_calibration",) if name in run.record}
+        run.finish_part(_PART, [], found.kept() | {"told": told})
+    file = run.folder / "camera.json"
     found.write(file)
     return replace(source, camera=file, fov=None), found
 
@@ -76,6 +84,18 @@ class Found:
     source: Literal["self-calibrated", "assumed"]
     deviation: float | None
     note: str
+
+    @classmethod
+    def of(cls, kept: Mapping[str, Any]) -> Found:
+        """Of what `kept` gave."""
+        model, width, height, *params = kept["camera"]
+        camera = camera_from_params(model, width, height, params, "the camera that was found")
+        return cls(camera, kept["source"], kept["deviation"], kept["note"])
+
+    def kept(self) -> dict[str, Any]:
+        """As plain values."""
+        c = self.camera
+        return vars(self) | {"camera": [c.name, c.width, c.height, *c.params]}
 
     def write(self, file: Path, camera: CameraModel | None = None) -> None:
         """camera.json; of another camera where the images were cut or resized."""

@@ -129,7 +129,7 @@ they make and would differ for that alone; c3vd and predict_self are the same ve
 
 LEFT_OUT = {"seconds", "started", "command", "versions", "revision", "peak_memory_mb", "arguments", "timings", "inputs"}
 LEFT_OUT |= {"files", "resumed"}
-"""Keys of JSON: times, the machine, and how the run was asked for."""
+"""Keys of JSON: times, the machine, how the run was asked for, and sizes of files in which those stand."""
 PASSED_OVER = ("config.yaml", "log.txt", "timings.csv", "timings.png", "tensorboard", "model.md")
 """Settings and times once more, and the card that model.safetensors holds as well."""
 COUNTED = ("sparse",)
@@ -259,16 +259,21 @@ def compared(base: Path, head: Path, name: str, tolerance: float) -> Iterator[st
     codes = [json.loads((folder / f"{name}.done").read_text())["code"] for folder in (base, head)]
     if codes[0] != codes[1]:
         yield f"{name}: exit code {codes[0]} became {codes[1]}"
-    before, after = files(base / name), files(head / name)
-    for only, where in ((before - after, "BASE"), (after - before, "HEAD")):
-        yield from (f"{name}/{path}: only in {where}" for path in sorted(map(str, only)))
-    if name in COUNTED and tolerance:
+    counted = name in COUNTED and tolerance
+    yield from (f"{name}/{line}" for line in differences(base / name, head / name, tolerance, not counted))
+    if counted:
         yield from _counted(base / name, head / name, name)
-        return
-    for path in sorted(before & after):
-        said = difference(base / name / path, head / name / path, tolerance)
+
+
+def differences(base: Path, head: Path, tolerance: float = 0.0, contents: bool = True) -> Iterator[str]:
+    """A line for each file of two results that only one has, or whose contents differ."""
+    before, after = files(base), files(head)
+    for only, where in ((before - after, "BASE"), (after - before, "HEAD")):
+        yield from (f"{path}: only in {where}" for path in sorted(map(str, only)))
+    for path in sorted(before & after) if contents else ():
+        said = difference(base / path, head / path, tolerance)
         if said:
-            yield f"{name}/{path}: {said if len(said) < 300 else f'{said[:140]} ... {said[-140:]}'}"
+            yield f"{path}: {said if len(said) < 300 else f'{said[:140]} ... {said[-140:]}'}"
 
 
 def files(folder: Path) -> set[Path]:

@@ -10,6 +10,7 @@ import pytest
 from raising import refused
 from test_detective_real import stella_frames, stella_map
 from test_sfm import HALF, PINHOLE, SCARAMUZZA, aligned, film, pose
+from verbs import by_options
 
 from densify.commands.sparse import sparse
 from lightdepth.camera import CameraModel
@@ -98,7 +99,7 @@ def test_a_map_that_its_images_do_not_hold_is_left_as_it_was_with_the_reason(see
 
 def test_poses_and_a_map_to_repair_are_not_given_together(tmp_path):
     with refused(where="--repair", found="--poses"):
-        sparse(tmp_path, tmp_path / "out", poses="truth", repair=tmp_path)
+        by_options(sparse)(tmp_path, tmp_path / "out", poses="truth", repair=tmp_path)
 
 
 @pytest.mark.slow

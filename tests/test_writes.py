@@ -24,8 +24,11 @@ _RUN = "it is given the run, or its folder in the making"
 ALLOWED = {
     "lightdepth/commands/convert_camera.py: convert_camera": "each format's writer uses write_whole",
     "lightdepth/commands/import_frames.py: import_frames": _RUN,
+    "lightdepth/commands/predict.py: _written": _RUN,
     "lightdepth/exporting/example.py: main": "an example that is exported, and that users run by themselves",
+    "lightdepth/reporting/kept.py: kept": _RUN,
     "lightdepth/prediction.py: save": "predict gives it the run's folder",
+    "lightdepth/reporting/batches.py: finish": _HIDDEN,
     "lightdepth/reporting/report.py: write": "verbs give it the run's folder, or write_together",
     "lightdepth/sfm/features.py: _match": _HIDDEN,
     "lightdepth/sfm/mapping.py: mapped": _HIDDEN,
@@ -44,6 +47,7 @@ ALLOWED = {
     "densify/exporting/work.py: export_maps": _RUN,
     "train/commands/ablate.py: _ablate": "write_table uses write_whole",
     "train/fit.py: __call__": "log.txt of a training, which grows while it lasts",
+    "train/commands/adapt.py: _fit": _RUN,
 }
 """Where a path is not seen to be below a run folder, and why it is whole nevertheless."""
 WRITERS = {"write_text", "write_bytes", "imwrite", "savez", "savez_compressed", "savetxt", "save_file", "tofile"}

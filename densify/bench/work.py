@@ -213,9 +213,16 @@ class CellFigures:
 
 def run_scene(scene: Predicted, config: BenchConfig, on_row: Callable[[], None] = lambda: None) -> list[CellFigures]:
     """The cells of a scene, one for each share of wrong points and each case. A row that cannot be judged says why."""
-    of = scene.rendered.scene
-    cells = [_cell(scene, share, config, on_row) for share in config.shares(of)]
-    return cells + [_case_cell(scene, case, config, on_row) for case in config.cases_of(of)]
+    return [make(scene) for make in cells_of(scene.rendered.scene, config, on_row).values()]
+
+
+def cells_of(
+    scene: Scene, config: BenchConfig, on_row: Callable[[], None] = lambda: None
+) -> dict[str, Callable[[Predicted], CellFigures]]:
+    """What makes the cells of a scene, by names that tell them apart."""
+    shares = {f"wrong {s:g}": partial(_cell, share=s, config=config, on_row=on_row) for s in config.shares(scene)}
+    cases = {str(case): partial(_case_cell, case=case, config=config, on_row=on_row) for case in config.cases_of(scene)}
+    return {**shares, **cases}
 
 
 def _case_cell(scene: Predicted, case: Case, config: BenchConfig, on_row: Callable[[], None]) -> CellFigures:

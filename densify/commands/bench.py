@@ -22,7 +22,7 @@ from densify.bench.estimators import (
 from densify.bench.record import notes, read_bench, record, tables
 from densify.bench.scenes import Size, scenes
 from densify.bench.verdict import compare
-from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, CellFigures, load_models, predicted, run_scene
+from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, cells_of, load_models, predicted
 from densify.config import DensifyConfig, OfflineConfig, Recipe
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
@@ -56,6 +56,7 @@ def run(
     image_size: Annotated[tuple[int, int] | None, at_least(32, up_to=10_000)] = None,
     method: Group[OfflineConfig] = OfflineConfig(),
     overwrite: bool = False,
+    resume: bool = False,
 ) -> None:
     """Synthetic colons made from seeds, judged row by row (bench compare A B, bench estimators: --help of each).
 
@@ -80,6 +81,8 @@ def run(
         image_size: Width and height of the keyframes, pixels; left out, 160 by 128 (small) or 320 by 256 (full). A
             larger one shows finer detail and takes longer.
         overwrite: Replace a run made before.
+        resume: Go on with the run that was stopped there, as it was begun; maps of a scene that were judged are not
+            made again.
     """
     arguments = recorded(
         method,
@@ -103,26 +106,35 @@ def run(
         densify=DensifyConfig(**vars(method)),
     )
     models = load_models(checkpoints)
-    with run_folder(output, "bench", arguments, overwrite) as folder:
-        cells, seconds = _cells(config, models)
-        found = record(config, [cell.record() for cell in cells], seconds)
+    with run_folder(output, "bench", arguments, overwrite, resume) as folder:
+        folder.hash_inputs(**{checkpoint: Path(checkpoint) for checkpoint in checkpoints})
+        cells, seconds = _cells(folder, config, models)
+        found = record(config, cells, seconds)
         _write_json(folder, "bench.json", found)
         text = "\n".join([*(t.markdown() for t in tables(found)), *(f"{note}\n" for note in notes(found))])
         (folder.folder / "bench.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         folder.log(text)
 
 
-def _cells(config: BenchConfig, models: Sequence[DepthModel]) -> tuple[list[CellFigures], dict[str, float]]:
-    """The cells of all scenes, and the seconds that each scene took."""
+def _cells(
+    folder: Run, config: BenchConfig, models: Sequence[DepthModel]
+) -> tuple[list[Mapping[str, object]], dict[str, float]]:
+    """The cells of all scenes as bench.json has them, each a finished part, and the seconds that each scene took."""
     chosen = scenes(config.size, config.first_seed)
-    cells: list[CellFigures] = []
+    cells: list[Mapping[str, object]] = []
     seconds: dict[str, float] = {}
     with Progress("Benchmark", sum(config.rows_of(s) * s.keyframes for s in chosen)) as bar:
         for scene in chosen:
-            start = time.perf_counter()
-            seen = predicted(scene, config.image_size, models, config.cases_of(scene))
-            cells += run_scene(seen, config, partial(bar.advance, scene.keyframes))
-            seconds[scene.name] = round(time.perf_counter() - start, 3)
+            start, seen = time.perf_counter(), None
+            for name, make in cells_of(scene, config, partial(bar.advance, scene.keyframes)).items():
+                part = f"{scene.name}, {name}"
+                if not folder.done(part):
+                    seen = seen or predicted(scene, config.image_size, models, config.cases_of(scene))
+                    folder.finish_part(part, [], [make(seen).record(), time.perf_counter() - start])
+                    start = time.perf_counter()
+                cell, taken = folder.kept_of(part)
+                cells.append(cell)
+                seconds[scene.name] = round(seconds.get(scene.name, 0.0) + taken, 3)
     return cells, seconds
 
 

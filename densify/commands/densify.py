@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
-from densify.inputs import MapSource, check_unit, doubts_of_inputs, fitted_light, map_and_frames
+from densify.inputs import MapSource, SurfaceFiles, doubts_of_inputs, fitted_light, map_and_frames
 from densify.joining import MergeConfig
 from densify.page import densify_page, joined_section
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
-from lightdepth.errors import InputError
-from lightdepth.ranges import above
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
 
@@ -26,12 +23,12 @@ def densify(
     checkpoint: str = DEFAULT_CHECKPOINT,
     config: Group[DensifyConfig] = DensifyConfig(),
     sfm: SfmConfig = SfmConfig(),
-    formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply",),
-    mm_per_unit: Annotated[float | None, above(0)] = None,
+    files: Group[SurfaceFiles] = SurfaceFiles(),
     fit_light: bool = True,
     merge: bool = True,
     merging: MergeConfig = MergeConfig(),
     overwrite: bool = False,
+    resume: bool = False,
 ) -> None:
     """Dense surfaces from frames and a sparse map, one per submap, and one more for submaps that meet.
 
@@ -40,43 +37,36 @@ def densify(
         checkpoint: Depth model: path of a checkpoint, name of a bundled one, decline (a formula from how light fades,
             no network) or constant (all equally far, to compare with).
         sfm: how frames are mapped when there is no map
-        formats: Formats of the mesh files to write: ply, which must be among them, and besides it glb and obj if
-            wanted.
-        mm_per_unit: Millimetres per map unit, where known: lengths and surfaces are then written in mm, else in map
-            units. It is one factor for all submaps, right for those that share a unit. A larger one makes a larger
-            surface.
         fit_light: Where neither --light nor the folder gives the light, fit it on the map, and use it if depth by it
             fits hidden blocks of wall better; switched off, a usual light is assumed.
         merge: Join submaps that see the same tissue, and write one surface for each group besides the single ones;
             switched off, submaps stay apart.
         merging: when two submaps are one
         overwrite: Replace a run made before.
+        resume: Go on with the run that was stopped there, as it was begun; a sparse map, a light and submaps that are
+            done are not made again.
     """
-    if "ply" not in formats:
-        raise InputError("--formats", f"{list(formats)}", "expected ply, and besides it glb and obj if wanted")
-    check_unit(mm_per_unit)
     model = load_model(checkpoint, details=False)  # before minutes are spent on a sparse map
     arguments = recorded(
         source,
         mapped,
         config,
+        files,
         output=output,
         checkpoint=checkpoint,
         sfm=sfm,
-        formats=formats,
-        mm_per_unit=mm_per_unit,
         fit_light=fit_light,
         merge=merge,
         merging=merging,
     )
-    with run_folder(output, "densify", arguments, overwrite) as run:
+    with run_folder(output, "densify", arguments, overwrite, resume) as run:
+        run.hash_inputs(**source.files, map=mapped.map, checkpoint=Path(checkpoint))
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
-        run.hash_inputs(**source.files, map=mapped.map)
         doubts = doubts_of_inputs(run, sparse_map, frames)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
-        work = Densified.make(frames, sparse_map, model, config, merging if merge else None)
+        work = Densified.make(frames, sparse_map, model, config, merging if merge else None, run)
         work.doubts = doubts
-        work.write(run, formats, mm_per_unit)
+        work.write(run, files.formats, files.mm_per_unit)
         proposals = {} if mapped.map is None or mapped.repair_map else work.proposals()
         for map_id, proposal in proposals.items():
             run.log(f"map {map_id}: {proposal}")
@@ -84,7 +74,7 @@ def densify(
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
         notes += [f"Warning: {said}" for said in run.record["warnings"]]
         notes += [f"Map {map_id}: {proposal}." for map_id, proposal in proposals.items()]
-        page = densify_page("Densified maps", work.results, work.gallery, notes, None, mm_per_unit)
+        page = densify_page("Densified maps", work.results, work.gallery, notes, None, files.mm_per_unit)
         if work.merged is not None:
             joined_section(page, work.merged)
         page.write(run.folder / "report.html")

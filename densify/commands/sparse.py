@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,23 @@ from lightdepth.sfm.made import made_sparse
 from lightdepth.uncalibrated import open_frames
 
 
+@dataclass(frozen=True)
+class Beginning:
+    """What is known of the frames' poses."""
+
+    poses: str | None = None
+    """Known poses of the frames: truth (those of the sequence), or a TUM file (world from camera) whose times are frame
+    numbers, or seconds where the frames are stamped or --map-fps counts; only points are then found. Left out, poses
+    are found as well."""
+    repair: Path | None = None
+    """Sparse map of the frames to make anew, by matching the images of its keyframes, beginning at its poses and
+    keeping its frame and scale; not with --poses. Left out, the map is made of all frames."""
+
+    def __post_init__(self) -> None:
+        if self.repair is not None and self.poses is not None:
+            raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
+
+
 def sparse(
     data: Path,
     output: Path,
@@ -30,11 +48,11 @@ def sparse(
     fov: Annotated[float | None, Range(10, 175)] = None,
     mask: Path | None = None,
     bit_depth: Annotated[int | None, Range(8, 32)] = None,
-    poses: str | None = None,
-    repair: Path | None = None,
+    begun: Group[Beginning] = Beginning(),
     sfm: SfmConfig = SfmConfig(),
     reading: Group[MapReading] = MapReading(),
     overwrite: bool = False,
+    resume: bool = False,
 ) -> None:
     """A sparse map by pycolmap, where there is no SLAM output or a poor one.
 
@@ -49,19 +67,16 @@ def sparse(
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
             their highest values show. A larger one reads the same numbers as darker.
-        poses: Known poses of the frames: truth (those of the sequence), or a TUM file (world from camera) whose times
-            are frame numbers, or seconds where the frames are stamped or --map-fps counts; only points are then found.
-            Left out, poses are found as well.
-        repair: Sparse map of the frames to make anew, by matching the images of its keyframes, beginning at its poses
-            and keeping its frame and scale; not with --poses. Left out, the map is made of all frames.
         sfm: how frames are mapped
         overwrite: Replace a folder made before.
+        resume: Go on with the run that was stopped there, as it was begun; features and matches that are done, up to
+            the last minute, are not made again.
     """
-    if repair is not None and poses is not None:
-        raise InputError("--repair", "with --poses", "give one of them: a map has its own poses")
+    poses, repair = begun.poses, begun.repair
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth, fov=fov)
     arguments = recorded(
         reading,
+        begun,
         output=output,
         data=data,
         format=format,
@@ -69,12 +84,10 @@ def sparse(
         fov=fov,
         mask=mask,
         bit_depth=bit_depth,
-        poses=poses,
-        repair=repair,
         sfm=sfm,
     )
-    with run_folder(output, "sparse", arguments, overwrite) as run:
-        run.hash_inputs(data=data, repair=repair)
+    with run_folder(output, "sparse", arguments, overwrite, resume) as run:
+        run.hash_inputs(**source.files, repair=repair, poses=None if poses in (None, "truth") else Path(poses))
         if repair is not None:
             map_and_frames(run, source, MapSource.read_as(repair, reading, repair_map=True), sfm)
             return

@@ -35,7 +35,7 @@ _GENERAL = {
     "print_config": "Print all settings, those given before it among them, as YAML that --config reads, and exit. "
     "`=skip_null` leaves out those that are not set.",
 }
-_LAST = ("overwrite", "config", "print_config", "print_shtab", "help")
+_LAST = ("overwrite", "resume", "config", "print_config", "print_shtab", "help")
 _GROUP = "YAML file with any of the options of this group."
 
 

@@ -39,6 +39,7 @@ def import_frames(
     frames: bool = True,
     keep_names: bool = False,
     overwrite: bool = False,
+    resume: bool = False,
 ) -> None:
     """A video or a folder of frames as a sequence, without the patient's name, and a report on what is wrong with it.
 
@@ -52,6 +53,8 @@ def import_frames(
         keep_names: Let run.json and the report hold the names of files; switched off, they are left out, as they may
             tell the patient.
         overwrite: Replace a folder made before.
+        resume: Go on with the run that was stopped there, as it was begun; frames that are done are not measured or
+            written again.
     """
     arguments = recorded(
         source,
@@ -63,11 +66,12 @@ def import_frames(
         keep_names=keep_names,
     )
     if not keep_names:
-        paths = [name for name in (*source.files, "light", "overlay_mask") if arguments[name] is not None]
+        paths = [name for name in (*source.files, "overlay_mask") if arguments[name] is not None]
         arguments |= {name: "(name left out)" for name in paths if "=" not in str(arguments[name])}
-    with run_folder(output, "import", arguments, overwrite, inputs=(source, overlay_mask)) as run:
+    with run_folder(output, "import", arguments, overwrite, resume, inputs=(source, overlay_mask)) as run:
         calibrated, found_camera = with_camera(source, run)
         opened, files = open_source(calibrated)
+        run.check_inputs(**source.files, overlay_mask=overlay_mask)
         if opened.video is not None and choice.rate is None and choice.every is None:
             choice = replace(choice, rate=DEFAULT_RATE)
         if not keep_names:
@@ -75,7 +79,7 @@ def import_frames(
         run.record["inputs"] = {"source": {"sha256_of_contents": content_hash(files)}}
         given_text = None if overlay_mask is None else read_overlay_mask(overlay_mask, opened)
         regions = find_regions(opened, find_text, given_text, shape.deinterlace)
-        scan = scanned(opened, regions.tissue, choice, shape.deinterlace)
+        scan = scanned(run, opened, regions.tissue, choice, shape.deinterlace)
         fate = selected(scan.times, scan.measures, choice)
         found = doubts(opened, scan, fate, regions, shape.deinterlace, find_text)
         geometry = Geometry.of(opened, regions.tissue, shape)

@@ -13,9 +13,12 @@ from lightdepth.colour import ColourMeter
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
+from lightdepth.frame import Frame
 from lightdepth.hidden_uncertainty import read_factor
+from lightdepth.prediction import DepthPrediction
 from lightdepth.ranges import at_least
 from lightdepth.refine import RefineConfig, RefinedModel
+from lightdepth.reporting.batches import batches
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
@@ -30,6 +33,7 @@ def predict(
     uncertainty: Path | None = None,
     previews: bool = True,
     overwrite: bool = False,
+    resume: bool = False,
 ) -> None:
     """Distance, albedo and normals of every frame of a sequence, as one .npz a frame.
 
@@ -47,6 +51,8 @@ def predict(
         previews: true: a PNG with the image and its distance is written for every frame as well, into previews/. false:
             none is.
         overwrite: Replace a folder made before. Without it, a folder that is already there is refused.
+        resume: Go on with the run that was stopped there, as it was begun; frames that are done are not predicted
+            again.
     """
     arguments = recorded(
         source, output=output, checkpoint=checkpoint, refine=refine, uncertainty=uncertainty, previews=previews
@@ -59,31 +65,36 @@ def predict(
     factor = None if uncertainty is None else read_factor(uncertainty, model.name)
     if refine:
         model = RefinedModel(model, RefineConfig(steps=refine))
-    with run_folder(output, "predict", arguments, overwrite) as run:
+    with run_folder(output, "predict", arguments, overwrite, resume) as run:
+        run.hash_inputs(**source.files, checkpoint=Path(checkpoint), uncertainty=uncertainty)
         frames = open_frames(source, run).without_truth()
-        run.hash_inputs(data=source.data)
         if previews:
-            (run.folder / "previews").mkdir()
+            (run.folder / "previews").mkdir(exist_ok=True)
         nothing, meter = 0, ColourMeter()
         with Progress("Predicting", len(frames)) as bar:
-            for i in range(len(frames)):
-                try:
-                    frame = frames[i]
-                except InputError as error:
-                    run.fail(frames.names[i], str(error))
-                    meter.apart()
+            for batch in batches(run, "frames", len(frames)):
+                if batch.finished:
+                    meter.go_on(batch.kept["colours"], batch.arrays())
+                    nothing += batch.kept["nothing"]
+                    bar.advance(len(batch))
                     continue
-                meter.add(frame.image, frame.valid)
-                prediction = model(frame)
-                nothing += not prediction.valid.any()
-                if factor is not None and prediction.uncertainty is not None:
-                    prediction = replace(prediction, uncertainty=prediction.uncertainty * np.float32(factor))
-                prediction.save(run.folder / f"{frame.name}.npz")
-                if previews:
-                    colors = colored_distance(prediction.distance, prediction.valid)
-                    picture = side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)])
-                    (run.folder / "previews" / f"{frame.name}.png").write_bytes(png(picture))
-                bar.advance()
+                taken, black = meter.taken(), 0
+                for i in batch:
+                    bar.advance()
+                    try:
+                        frame = frames[i]
+                    except InputError as error:
+                        run.fail(frames.names[i], str(error))
+                        meter.apart()
+                        continue
+                    meter.add(frame.image, frame.valid)
+                    prediction = model(frame)
+                    black += not prediction.valid.any()
+                    if factor is not None and prediction.uncertainty is not None:
+                        prediction = replace(prediction, uncertainty=prediction.uncertainty * np.float32(factor))
+                    batch.files += _written(run.folder, frame, prediction, previews)
+                batch.finish({"nothing": black, "colours": meter.since(taken)}, meter.last())
+                nothing += black
         if len(run.record["failures"]) == len(frames):
             raise InputError(source.data, "no frame could be read", f"the first: {run.record['failures'][0]['reason']}")
         if nothing:
@@ -94,3 +105,14 @@ def predict(
         run.record["colour"] = colours.record()
         run.record["checkpoint"] = model.name
         run.record["uncertainty_factor"] = factor
+
+
+def _written(folder: Path, frame: Frame, prediction: DepthPrediction, previews: bool) -> list[Path]:
+    """The files of a frame."""
+    file, preview = folder / f"{frame.name}.npz", folder / "previews" / f"{frame.name}.png"
+    prediction.save(file)
+    if not previews:
+        return [file]
+    colors = colored_distance(prediction.distance, prediction.valid)
+    preview.write_bytes(png(side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)])))
+    return [file, preview]

@@ -62,4 +62,5 @@ class SequenceSource:
     def files(self) -> dict[str, Path | None]:
         """The files and folders that are read, by the name of their option."""
         camera = None if self.asks_for_camera else self.camera
-        return {"data": self.data, "camera": camera, "mask": self.mask}
+        light = Path(self.light) if self.light and "=" not in self.light and Path(self.light).is_file() else None
+        return {"data": self.data, "camera": camera, "light": light, "mask": self.mask}

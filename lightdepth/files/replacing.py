@@ -23,8 +23,9 @@ from lightdepth.files.writing import PARTIAL, check_writable, is_dead_partial, m
 RECORD = "run.json"
 """The file that says that a folder is the whole result of a run, of which verb, and which files are the run's."""
 
-BEGUN, PARTS = "begun.json", "parts.jsonl"
-"""In an unfinished run: what it was begun with, which also says that the folder is ours; and its finished parts."""
+BEGUN, PARTS, STATE = "begun.json", "parts.jsonl", ".state"
+"""In an unfinished run: what it was begun with, which also says that the folder is ours; its finished parts; and a
+folder for what only a run that is resumed reads."""
 
 _LONGEST = 240
 """The longest name of an output, in bytes: file systems take 255, and its hidden neighbours have longer names."""

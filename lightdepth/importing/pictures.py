@@ -19,6 +19,7 @@ from lightdepth.importing.scan import Scan
 from lightdepth.importing.selection import BLURRED, DOUBLE, FROZEN, KEPT
 from lightdepth.importing.source import Source
 from lightdepth.ranges import PIXELS, checked
+from lightdepth.reporting.batches import batches
 from lightdepth.reporting.figures import thumbnail
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run
@@ -96,23 +97,37 @@ def write_pictures(
     kept = np.flatnonzero(fate == KEPT)
     left_out = np.flatnonzero(np.isin(fate, (BLURRED, DOUBLE, FROZEN)))
     shown = {*kept[_spread(len(kept), _PICTURES)], *left_out[_spread(len(left_out), _EXAMPLES)]}
-    (run.folder / "frames").mkdir()
+    (run.folder / "frames").mkdir(exist_ok=True)
     pictures: list[Picture] = []
-    times = {}
+    times: dict[str, float] = {}
+    every = sorted({*kept, *shown})
     with Progress("Writing frames", len(kept)) as bar:
-        for k in sorted({*kept, *shown}):
-            pixels, time = source.read(int(scan.rows[k]))
-            pixels = one_field(pixels) if deinterlace else pixels
-            pixels = geometry.applied(np.where(regions.shown[..., None], pixels, 0).astype(pixels.dtype))
-            name = f"{source.numbers[scan.rows[k]]:06d}"
-            if k in shown:
-                label = name if fate[k] == KEPT else f"{name} {fate[k]}"
-                pictures.append((thumbnail(eight_bits(pixels), 160), label, fate[k] == KEPT))
-            if fate[k] == KEPT:
-                write_image(run.folder / "frames" / f"{name}.png", pixels[..., ::-1])
-                if np.isfinite(time):
-                    times[name] = time
-                bar.advance()
+        for batch in batches(run, "pictures", len(every)):
+            if batch.finished:
+                small = batch.arrays()
+                pictures += [(small[str(n)], *label) for n, label in enumerate(batch.kept["labels"])]
+                times |= batch.kept["times"]
+                bar.advance(sum(fate[k] == KEPT for k in every[batch.start : batch.end]))
+                continue
+            before, stamps = len(pictures), {}
+            for k in (every[i] for i in batch):
+                pixels, time = source.read(int(scan.rows[k]))
+                pixels = one_field(pixels) if deinterlace else pixels
+                pixels = geometry.applied(np.where(regions.shown[..., None], pixels, 0).astype(pixels.dtype))
+                name = f"{source.numbers[scan.rows[k]]:06d}"
+                if k in shown:
+                    label = name if fate[k] == KEPT else f"{name} {fate[k]}"
+                    pictures.append((thumbnail(eight_bits(pixels), 160), label, bool(fate[k] == KEPT)))
+                if fate[k] == KEPT:
+                    batch.files.append(run.folder / "frames" / f"{name}.png")
+                    write_image(batch.files[-1], pixels[..., ::-1])
+                    if np.isfinite(time):
+                        stamps[name] = time
+                    bar.advance()
+            new = pictures[before:]
+            kept_of_it = {"labels": [label for _, *label in new], "times": stamps}
+            batch.finish(kept_of_it, {str(n): small for n, (small, *_) in enumerate(new)})
+            times |= stamps
     if times:
         write_times(run.folder / "times.csv", times)
     write_image(run.folder / "mask.png", geometry.mask.astype(np.uint8) * 255)

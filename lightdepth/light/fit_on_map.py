@@ -241,6 +241,10 @@ def fit_assumed_light(
     """
     if not frames[0].light.assumed:
         return None
+    if run.done("light"):
+        light_fit, kept = run.kept_of("light")
+        run.record["light_fit"] = light_fit
+        return None if kept is None else PhotometricCalibration(**kept)
     start = time.perf_counter()
     found: dict[str, object] = {"used": False}
     light = None
@@ -260,6 +264,7 @@ def fit_assumed_light(
     found["seconds"] = round(time.perf_counter() - start, 3)
     run.record["light_fit"] = plain(found)
     run.log(f"light {found['summary']}")
+    run.finish_part("light", [], [found, light])
     return light
 
 

@@ -25,6 +25,7 @@ from lightdepth.files.machine import machine_failure
 from lightdepth.files.replacing import (
     BEGUN,
     PARTS,
+    STATE,
     check_apart,
     check_replaceable,
     discard,
@@ -82,15 +83,25 @@ class Run:
         self.parts = None if parts is None else dict(parts)
         self.resumed = bool(parts)
         self._told: set[str] = set()  # finished parts whose reports are in the record
-        self._mark = (0, 0)
+        self._begun: dict[str, tuple[int, int]] = {}  # failures and warnings when a part began: parts may lie in parts
         self._verb, self._arguments, self._start = verb, plain(arguments), time.time()
+
+    @property
+    def resumable(self) -> bool:
+        """Whether finished parts are kept when the run is stopped."""
+        return self.parts is not None
+
+    @property
+    def state(self) -> Path:
+        """A folder for files of parts that only a run that is resumed reads: it is gone from the finished run."""
+        return self.folder / STATE
 
     def done(self, part: str) -> bool:
         """Whether a part was finished before: its files are there, and its failures and warnings are in the record
         now, where they would be had it run. Else it begins here: what is reported from now on is its own."""
         found = (self.parts or {}).get(part)
         if found is None:
-            self._mark = (len(self.record["failures"]), len(self.record["warnings"]))
+            self._begun[part] = (len(self.record["failures"]), len(self.record["warnings"]))
             return False
         if part not in self._told:
             self._told.add(part)
@@ -110,7 +121,7 @@ class Run:
             sizes = new_files(self.folder, (name for each in self.parts.values() for name in each.files))
         else:
             sizes = {str(file.relative_to(self.folder)): file.stat().st_size for file in files}
-        failures, warned = self._mark
+        failures, warned = self._begun.get(part, (0, 0))
         made = Part(part, sizes, self.record["failures"][failures:], self.record["warnings"][warned:], plain(kept))
         add_part(self.folder, made, [self.folder / name for name in sizes])
         self.parts[part] = made
@@ -140,16 +151,27 @@ class Run:
         self.log(f"warning: {message}")
 
     def hash_inputs(self, **paths: Path | None) -> None:
-        """Notes what files and folders were read, by name; None is one that was not given."""
+        """Notes what files and folders are read, by name; those that are None, or not there, are left out."""
+        self.record.setdefault("inputs", {}).update(self._hashed(paths))
+        self._note_inputs(self.record["inputs"])
+
+    def check_inputs(self, **paths: Path | None) -> None:
+        """As hash_inputs, for a verb that does not tell the names of files: run.json says nothing of them."""
+        # By no name of an argument: the arguments of such a verb have no paths.
+        self._note_inputs(self._hashed({f"the {name}": path for name, path in paths.items()}))
+
+    def _hashed(self, paths: Mapping[str, Path | None]) -> dict[str, dict[str, str]]:
+        found = {}
         for name, path in paths.items():
-            if path is not None:
-                self.record.setdefault("inputs", {})[name] = {
-                    "path": str(path),
-                    "sha256": input_hash(path, self.output),
-                }
+            with suppress(OSError):  # whoever reads it says what is wrong with it
+                if path is not None and path.exists():
+                    found[name] = {"path": str(path), "sha256": input_hash(path, self.output)}
+        return found
+
+    def _note_inputs(self, inputs: Mapping[str, Any]) -> None:
+        """A run that is resumed compares them."""
         if self.parts is not None and not self.resumed:
-            arguments = compared(self._arguments)
-            begin(self.folder, {"verb": self._verb, "arguments": arguments, "inputs": self.record.get("inputs", {})})
+            begin(self.folder, {"verb": self._verb, "arguments": compared(self._arguments), "inputs": inputs})
 
     @contextmanager
     def hearing(self) -> Iterator[None]:
@@ -165,7 +187,8 @@ class Run:
             line: str | None = None,
         ) -> None:
             shown(message, category, filename, lineno, file, line)
-            if issubclass(category, UserWarning):  # a library's deprecations are no news to a user
+            # A library's deprecations are no news to a user; what a process that was killed heard is heard again.
+            if issubclass(category, UserWarning) and str(message) not in self.record["warnings"]:
                 self.record["warnings"].append(str(message))
                 self._note(f"warning: {message}")
 
@@ -178,6 +201,7 @@ class Run:
     def finish(self) -> None:
         import yaml
 
+        discard(self.state)
         (self.folder / "config.yaml").write_text(yaml.safe_dump(self._arguments, sort_keys=False), encoding="utf-8")
         sync_below(self.folder)  # run.json says that the rest is whole: it comes last
         write_run_json(self.folder, self._verb, self._arguments, self._start, self.record)

@@ -62,18 +62,22 @@ def paths_in(value: Any) -> list[Path]:
 
 
 def input_hash(path: Path, without: Path | None = None) -> str:
-    """SHA-256 over names and sizes of the files below a path, and over the contents of those up to 1 MB. Results of
-    runs below it are passed over, and so is `without`, a folder that is being made."""
+    """SHA-256 over names and sizes of the files below a path, and over the contents of those up to 1 MB; of a single
+    file, up to 1 GB: another checkpoint has the same size. Results of runs below it are passed over, and so is
+    `without`, a folder that is being made."""
     if not path.exists():
         raise InputError(path, "no such file or folder", "correct its name, or put it there")
     digest = hashlib.sha256()
     files = files_below(path, without) if path.is_dir() else [path]
+    read = 1 << 20 if path.is_dir() else 1 << 30
     for file in files:
         size = file.stat().st_size
         name = file.relative_to(path) if path.is_dir() else file.name
         digest.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape"))
-        if size <= 1 << 20:
-            digest.update(file.read_bytes())
+        if size <= read:
+            with file.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    digest.update(block)
     return digest.hexdigest()
 
 

@@ -21,6 +21,7 @@ from lightdepth.frame import Frame, frame_number
 from lightdepth.image_quality import Measures, Meter
 from lightdepth.native import pycolmap
 from lightdepth.sfm.config import ADVICE, Progress, SfmConfig
+from lightdepth.sfm.keeping import KeptDatabase
 from lightdepth.sfm.retrieval import frame_pairs
 from lightdepth.sfm.unmapped import Matching
 
@@ -107,18 +108,25 @@ def usable_pixels(frame: Frame, config: SfmConfig) -> np.ndarray:
 
 
 def features_and_matches(
-    work: Path, camera: CameraModel, names: list[str], config: SfmConfig, progress: Progress
+    work: Path,
+    camera: CameraModel,
+    names: list[str],
+    config: SfmConfig,
+    progress: Progress,
+    kept: KeptDatabase | None = None,
 ) -> Matching:
-    """Fills work/database.db from work/images and work/masks; what there was to match, frames by place in names."""
-    pc, database = pycolmap(), work / "database.db"
+    """Fills work/database.db from work/images and work/masks; what there was to match, frames by place in names. What
+    `kept` holds is not made again."""
+    pc, database, kept = pycolmap(), work / "database.db", kept or KeptDatabase()
     with quiet(pc):
         pc.set_random_seed(config.seed)
-        _extract(pc, work, database, camera, names, config, progress)
+        kept.restore(database)
+        _extract(pc, work, kept, camera, names, config, progress)
         with pc.Database.open(database) as opened:
             ids = [opened.read_image_with_name(name).image_id for name in names]
             features = np.array([opened.num_keypoints_for_image(i) for i in ids])
             pairs = _pairs(opened, ids, config)
-        _match(pc, work, [(names[i], names[j]) for i, j in pairs], config, progress)
+        _match(pc, work, kept, [(names[i], names[j]) for i, j in pairs], config, progress)
         place = {image_id: k for k, image_id in enumerate(ids)}
         flat = pc.TwoViewGeometryConfiguration
         flat = {int(v) for v in (flat.PLANAR, flat.PANORAMIC, flat.PLANAR_OR_PANORAMIC)}
@@ -167,7 +175,13 @@ def _pairs(database: Any, ids: list[int], config: SfmConfig) -> list[tuple[int, 
 
 
 def _extract(
-    pc: Any, work: Path, database: Path, camera: CameraModel, names: list[str], config: SfmConfig, progress: Progress
+    pc: Any,
+    work: Path,
+    kept: KeptDatabase,
+    camera: CameraModel,
+    names: list[str],
+    config: SfmConfig,
+    progress: Progress,
 ) -> None:
     reader = pc.ImageReaderOptions()
     reader.camera_model, reader.mask_path = camera.name, work / "masks"
@@ -176,10 +190,12 @@ def _extract(
     options.use_gpu, options.num_threads = False, config.num_threads
     options.sift.max_num_features, options.sift.peak_threshold = config.max_features, config.peak_threshold
     piece = 4 if config.num_threads == 1 else 64  # small, for progress and so that an interrupt is heard
-    for start in range(0, len(names), piece):
+    if kept.features:
+        reader.existing_camera_id = 1
+    for start in range(kept.features, len(names), piece):
         progress("features", start, len(names))
         pc.extract_features(
-            database,
+            work / "database.db",
             work / "images",
             image_names=names[start : start + piece],
             camera_mode=pc.CameraMode.SINGLE,
@@ -188,17 +204,21 @@ def _extract(
             device=pc.Device.cpu,
         )
         reader.existing_camera_id = 1  # the one made by the first piece
+        kept.keep(work / "database.db", features=min(start + piece, len(names)))
+    kept.keep(work / "database.db", now=True)
     progress("features", len(names), len(names))
 
 
-def _match(pc: Any, work: Path, pairs: list[tuple[str, str]], config: SfmConfig, progress: Progress) -> None:
+def _match(
+    pc: Any, work: Path, kept: KeptDatabase, pairs: list[tuple[str, str]], config: SfmConfig, progress: Progress
+) -> None:
     """Matches and verifies the pairs of images, a piece at a time, for progress and so that an interrupt is heard."""
     matching, verification = pc.FeatureMatchingOptions(), pc.TwoViewGeometryOptions()
     matching.use_gpu, matching.num_threads = False, config.num_threads
     verification.ransac.random_seed, verification.detect_watermark = config.seed, False
     pairing, piece = pc.ImportedPairingOptions(), 100
     pairing.match_list_path = work / "pairs.txt"
-    for start in range(0, len(pairs), piece):
+    for start in range(kept.matches, len(pairs), piece):
         progress("matches", start, len(pairs))
         (work / "pairs.txt").write_text(
             "".join(f"{a} {b}\n" for a, b in pairs[start : start + piece]), encoding="utf-8"
@@ -210,6 +230,8 @@ def _match(pc: Any, work: Path, pairs: list[tuple[str, str]], config: SfmConfig,
             verification_options=verification,
             device=pc.Device.cpu,
         )
+        kept.keep(work / "database.db", matches=min(start + piece, len(pairs)))
+    kept.keep(work / "database.db", now=True)
     progress("matches", len(pairs), len(pairs))
 
 

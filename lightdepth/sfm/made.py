@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from lightdepth.frame import Frame
+from lightdepth.reporting.kept import kept
 from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
-from lightdepth.sfm.reconstruction import sparse_map_from_frames
+from lightdepth.sfm.keeping import KeptDatabase
+from lightdepth.sfm.reconstruction import SfmMap, sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
 from lightdepth.sparse_map import SparseMap
 
@@ -26,7 +29,9 @@ def made_sparse(
             stages.append(stage)
             run.log(f"sparse map: {stage}")
 
-    found = sparse_map_from_frames(frames, run.folder / "sparse", config, show, poses)
+    folder, database = run.folder / "sparse", KeptDatabase(run)
+    make = partial(sparse_map_from_frames, frames, folder, config, show, poses, database)
+    found = kept(run, "sparse map", SfmMap, make, folder=folder)
     for submap in found.submaps:
         errors = number(float(np.median(submap.reprojection_errors())))
         run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")

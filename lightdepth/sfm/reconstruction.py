@@ -32,6 +32,7 @@ from lightdepth.maps.colmap import holds_model
 from lightdepth.native import pycolmap
 from lightdepth.sfm.config import ADVICE, Progress, SfmConfig
 from lightdepth.sfm.features import far_matches, features_and_matches, frame_file, quiet, write_images
+from lightdepth.sfm.keeping import KeptDatabase
 from lightdepth.sfm.known_poses import PosesFit, fitting_poses
 from lightdepth.sfm.mapping import mapped, mapping_options, write_model
 from lightdepth.sfm.unmapped import reasons, summary
@@ -61,13 +62,15 @@ def sparse_map_from_frames(
     config: SfmConfig | None = None,
     progress: Progress | None = None,
     poses: Mapping[int, np.ndarray] | None = None,
+    database: KeptDatabase | None = None,
 ) -> SfmMap:
     """Frames -> submaps by number of frames, largest first, also written as COLMAP text models to out_folder/0, 1, ...
 
     Keyframes are named by their frame's number, six digits, `.png`. With `poses`, map_from_cam (4, 4) by frame number,
     nothing is moved: points are triangulated at these poses, in their unit, and there is one submap. Raises
     InputError, leaving out_folder as it was, when the frames cannot be mapped, the folder already holds a map, or the
-    matches fit the poses only when these are read in another way, which is named.
+    matches fit the poses only when these are read in another way, which is named. `database` keeps features and
+    matches.
     """
     config, progress, out_folder = config or SfmConfig(), progress or silent, Path(out_folder)
     check_free(out_folder)
@@ -81,7 +84,7 @@ def sparse_map_from_frames(
         fit = fisheye_fit(written.camera, written.valid) if isinstance(written.camera, Scaramuzza) else None
         camera, names = fit.camera if fit else written.camera, sorted(written.names)
         known = None if poses is None else _known_poses(poses, written.names)
-        matching = features_and_matches(Path(work), camera, names, config, progress)
+        matching = features_and_matches(Path(work), camera, names, config, progress, database)
         fitting = None
         if known is None:
             count = mapped(Path(work), names, config, progress)

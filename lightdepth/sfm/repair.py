@@ -27,6 +27,7 @@ from lightdepth.maps.colmap import read_submap
 from lightdepth.native import pycolmap
 from lightdepth.sfm.config import Progress, SfmConfig
 from lightdepth.sfm.features import features_and_matches, frame_file, quiet, write_images
+from lightdepth.sfm.keeping import KeptDatabase
 from lightdepth.sfm.mapping import mapping_options
 from lightdepth.sfm.reconstruction import (
     fisheye_fit,
@@ -90,10 +91,12 @@ def repaired_submap(
     out_folder: Path,
     config: SfmConfig | None = None,
     progress: Progress | None = None,
+    database: KeptDatabase | None = None,
 ) -> tuple[Submap, Repair]:
     """The submap made anew from `frames`, those of its keyframes, and what that changed; written to `out_folder` as a
     COLMAP text model. Its frame of reference and scale are the old one's. It comes back as it was, with the reason,
-    where the images do not hold three quarters of its keyframes or agree no better with the new poses."""
+    where the images do not hold three quarters of its keyframes or agree no better with the new poses. `database`
+    keeps features and matches."""
     config, progress = config or SfmConfig(), progress or silent
     if len(frames) < max(3, config.min_model_size):
         reason = f"{len(frames)} of its {len(submap.keyframes)} keyframes have a frame"
@@ -105,7 +108,8 @@ def repaired_submap(
             (work / part).mkdir()
         written = write_images(frames, work / "images", work / "masks", config, progress)
         fit = fisheye_fit(written.camera, written.valid) if isinstance(written.camera, Scaramuzza) else None
-        features_and_matches(work, fit.camera if fit else written.camera, sorted(written.names), config, progress)
+        camera = fit.camera if fit else written.camera
+        features_and_matches(work, camera, sorted(written.names), config, progress, database)
         given = {frame_file(k.name): turn_of(fit) @ k.cam_from_map for k in submap.keyframes}
         given = {name: pose for name, pose in given.items() if name in written.names}
         progress("mapping", 0, len(given))

@@ -71,7 +71,6 @@ def read_target(
     is written."""
     unjudged = ""
     sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, pairing)
-    run.hash_inputs(**source.files, map=map)
     training, held = parted(frames, config.held_out)
     check_exposed((training, held))
     if sparse_map is not None:

@@ -14,6 +14,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import lightning.pytorch as pl
+from safetensors.torch import load_file, save_file
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model, save_model
 from lightdepth.command_line.options import Group
@@ -21,12 +22,13 @@ from lightdepth.datasets import SequenceSource
 from lightdepth.detective import PairingConfig
 from lightdepth.errors import InputError
 from lightdepth.models import DeclineModel, NetworkModel, working_size
+from lightdepth.reporting.kept import kept
 from lightdepth.reporting.run import Run, plain, recorded, run_folder, versions
 from lightdepth.sfm.config import SfmConfig
 
 from ..adapting.card import AdaptedCard, target_loss
 from ..adapting.config import AdaptConfig
-from ..adapting.judging import Outcome, judged, looked_at, verdict
+from ..adapting.judging import Judgement, Outcome, judged, looked_at, verdict
 from ..adapting.module import Adaptation, merge_low_rank
 from ..adapting.report import Pictures, page
 from ..adapting.target import Target, adaptation, frame_data, read_target, replayed_frames
@@ -48,6 +50,7 @@ def adapt(
     pairing: Group[PairingConfig] = PairingConfig(),
     keep_worse: bool = False,
     overwrite: bool = False,
+    resume: bool = False,
 ) -> None:
     """Adapt a checkpoint to another endoscope or organ, from frames without truth.
 
@@ -67,6 +70,8 @@ def adapt(
             written. Where nothing judges, it is written in either case, but with false only if its answers stayed as
             steady as before (in mirrored, darker images).
         overwrite: Replace a run made before. Without it, a folder that is already there is refused.
+        resume: Go on with the run that was stopped there, as it was begun; a map, a light, the judgement of the start
+            and a training that is done are not made again.
     """
     if map is None and config.taught and config.judge == "none":
         raise InputError(
@@ -90,7 +95,8 @@ def adapt(
     if not isinstance(start, NetworkModel):
         raise InputError("--checkpoint", f"{checkpoint} has no weights to adapt", "expected a trained checkpoint")
     quiet()
-    with run_folder(output, "adapt", arguments, overwrite) as run:
+    with run_folder(output, "adapt", arguments, overwrite, resume) as run:
+        run.hash_inputs(**source.files, map=map, checkpoint=Path(checkpoint))
         target = read_target(run, source, map, fit_light, config, start, sfm, pairing)
         size = config.size or working_size(target.frames[0].camera, start.rows)
         data = frame_data(run, target, more, config, size, start)
@@ -109,7 +115,7 @@ def adapt(
 
         pictures = Pictures(target)
         pictures.add(start)
-        before = judged(module, data, start, target.held, wall)
+        before = kept(run, "start", Judgement, lambda: judged(module, data, start, target.held, wall))
         _fit(module, data, config.steps, run)
         merge_low_rank(module.network)
         adapted = NetworkModel(module.network, size[1], output.name, details=False)
@@ -129,6 +135,10 @@ def adapt(
 
 
 def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> None:
+    """Trains the network; where that was done before the run was stopped, it gets the weights that it had then."""
+    if run.done("training"):
+        module.network.load_state_dict(load_file(run.state / "trained.safetensors"))
+        return
     trainer = pl.Trainer(
         devices=1,
         logger=False,
@@ -142,6 +152,10 @@ def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> Non
         callbacks=[Diagnosis(DiagnosisConfig(), data.names), TrainingProgress(run.log, report_every(steps))],
     )
     trainer.fit(module, datamodule=data)
+    if run.resumable:
+        run.state.mkdir(exist_ok=True)
+        save_file(module.network.state_dict(), run.state / "trained.safetensors")
+        run.finish_part("training", [run.state / "trained.safetensors"])
 
 
 def _card(
