@@ -19,6 +19,7 @@ from lightdepth.brief import Brief
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
+from lightdepth.files.named_inputs import with_real_inputs
 from lightdepth.files.schema import read_json
 from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.sparse_map import Keyframe, Submap
@@ -257,9 +258,10 @@ def map_folders(path: Path) -> list[Path]:
 
 
 def run_record(path: Path) -> Mapping[str, object]:
-    """run.json of a run folder, or of the one that a map folder is in; empty where there is none."""
+    """run.json of a run folder, or of the one that a map folder is in, with the paths of its inputs; empty where there
+    is none."""
     folder = path.parent if map_folders(path) == [path] else path
-    return read_json(folder / "run.json") if (folder / "run.json").is_file() else {}
+    return with_real_inputs(read_json(folder / "run.json"), folder) if (folder / "run.json").is_file() else {}
 
 
 def read_dense_map(folder: str | Path) -> DenseMapFiles:

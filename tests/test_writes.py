@@ -17,6 +17,7 @@ MACHINERY = (
     "lightdepth/files/replacing.py",  # how a finished folder takes its place
     "lightdepth/files/lock.py",
     "lightdepth/reporting/run.py",  # the folder in the making: log.txt, config.yaml
+    "lightdepth/reporting/names.py",  # texts of the folder in the making, before run.json is
     "lightdepth/reporting/unfinished.py",  # what is kept of a run that can be resumed
 )
 _HIDDEN = "in a temporary folder that is hidden in the run folder in the making, whose models arrive by a rename"

@@ -65,7 +65,7 @@ def import_frames(
     if not keep_names:
         paths = [name for name in (*source.files, "light", "overlay_mask") if arguments[name] is not None]
         arguments |= {name: "(name left out)" for name in paths if "=" not in str(arguments[name])}
-    with run_folder(output, "import", arguments, overwrite, inputs=(source, overlay_mask)) as run:
+    with run_folder(output, "import", arguments, overwrite, None, (source, overlay_mask), keep_names) as run:
         calibrated, found_camera = with_camera(source, run)
         opened, files = open_source(calibrated)
         if opened.video is not None and choice.rate is None and choice.every is None:
