@@ -122,14 +122,17 @@ def test_the_config_of_a_run_serves_again_and_says_where_its_inputs_json_is_gone
 def dense(patient) -> Path:
     output = patient.parent / "dense"
     words = ["--map", str(patient / "frames" / "slam"), "--checkpoint", "decline", "-o", str(output)]
+    words += ["--no-fit-light", "--no-merge", "--judge.on", "false"]
     assert main(["densify", str(patient / "frames"), *words]) == 0
     return output
 
 
+@pytest.mark.slow
 def test_densify_names_no_patient(dense):
     assert telling(dense) == []
 
 
+@pytest.mark.slow
 def test_what_reads_a_run_finds_its_inputs_and_names_no_patient(dense, patient, tmp_path):
     assert main(["export", str(dense), "--to", "nerfstudio", "-o", str(tmp_path / "nerf")]) == 0
     assert any((tmp_path / "nerf").rglob("images/*.png"))
@@ -150,3 +153,14 @@ def test_a_spoilt_inputs_json_is_refused(tmp_path):
     (tmp_path / "out" / INPUTS).write_text("[")
     with pytest.raises(InputError):
         run_on(tmp_path / "out", data, resume=True)
+
+
+@pytest.mark.slow
+def test_a_training_names_no_patient_in_any_file_and_goes_on_from_its_own_settings(patient, tmp_path):
+    run = tmp_path / "run"
+    words = ["--data.sequences", str(patient / "frames"), "--model.network.kind", "tiny", "--data.size", "[64, 48]"]
+    steps = ["--trainer.max_steps", "2", "--trainer.accelerator", "cpu", "-o", str(run)]
+    assert main(["train", *words, *steps]) == 0
+    assert telling(run) == [] and stat.S_IMODE((run / INPUTS).stat().st_mode) == 0o600
+    assert main(["train", "--resume", "--trainer.max_steps", "3", "-o", str(run)]) == 0
+    assert telling(run) == []

@@ -18,6 +18,7 @@ from lightdepth.files.writing import write_together
 from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.light.report import light_page
+from lightdepth.reporting.names import told
 
 
 def calibrate_light(
@@ -70,5 +71,11 @@ def calibrate_light(
         check_pairing(sparse_map, frames, pairing, given=given)
         fit = fit_on_map(frames, sparse_map, camera=given, rng=rng)
         what = f"{data}, {sparse_map.source}"
-    write_together({page_path: light_page(fit, what).write, output: lambda path: write_light(fit.light, path)})
+    page = light_page(fit, told(what, data=data, map=map))
+    write_together(
+        {
+            page_path: page.write,
+            output: lambda path: write_light(fit.light, path),
+        }
+    )
     print(f"light: {fit.summary()}\n{output}, {page_path}")

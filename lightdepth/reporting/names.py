@@ -52,6 +52,10 @@ class Names:
     unlisted: dict[str, str] = field(default_factory=dict)
     """more of the kind of `paths`, which no inputs.json is to have"""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is made when it is first asked for: processes that load data are given a copy."""
+        return {key: value for key, value in vars(self).items() if key in ("paths", "output", "unlisted")}
+
     def hidden(self, value: Any, exactly: bool = False) -> Any:
         """A plain value with names in the place of paths, also in the keys of mappings. `exactly`: of arguments, a
         text that is one of the paths, and no more than a single word, is one too."""
@@ -71,6 +75,10 @@ class Names:
     def text(self, text: str) -> str:
         """A text with names in the place of paths and of words in them that tell."""
         return self._words(self._of_paths(text))
+
+    def of(self, path: str) -> str:
+        """The name of a path; itself where it has none."""
+        return str(self.hidden(path, exactly=True))
 
     def command(self, words: Iterable[str]) -> list[str]:
         """The words of a command line, an option's value after a sign of equality too."""
@@ -176,6 +184,12 @@ def names_of(
         for folder in (Path(path), Path(path).parent):
             others = {name: each for name, each in real_inputs(folder).items() if name not in names} | others
     return Names({name: path for name, path in names.items() if name not in others}, tuple(output), others)
+
+
+def told(text: str, **inputs: object) -> str:
+    """A sentence as a report has it, of a verb that makes no run folder: without the paths of its inputs, unless
+    `--keep-names` was given."""
+    return text if KEPT.get() else names_of(inputs).text(text)
 
 
 def _inputs(value: Any, option: str = "input") -> Iterator[tuple[str, str]]:
