@@ -43,7 +43,8 @@ ALLOWED = {
     "densify/dense_map.py: write": _RUN,
     "densify/densified.py: write": _RUN,
     "densify/exporting/work.py: export_maps": _RUN,
-    "train/commands/ablate.py: _ablate": "write_table uses write_whole",
+    "train/commands/ablate.py: _ablate": "write_table and write_inputs use write_whole",
+    "train/fit.py: fit": "write_inputs uses write_whole",
     "train/fit.py: __call__": "log.txt of a training, which grows while it lasts",
 }
 """Where a path is not seen to be below a run folder, and why it is whole nevertheless."""
