@@ -20,6 +20,7 @@ from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.meshes import load_mesh
+from lightdepth.files.named_inputs import with_real_inputs
 from lightdepth.files.reading import reading
 from lightdepth.files.schema import read_json
 from lightdepth.files.tum import read_tum, write_tum
@@ -259,14 +260,15 @@ def map_folders(path: Path) -> list[Path]:
 
 
 def run_record(path: Path) -> Mapping[str, object]:
-    """run.json of a run folder, or of the one that a map folder is in; empty where there is none."""
+    """run.json of a run folder, or of the one that a map folder is in, with the paths of its inputs; empty where there
+    is none."""
     folder = path.parent if map_folders(path) == [path] else path
     if not (folder / "run.json").is_file():
         return {}
     found = read_json(folder / "run.json")
     if not isinstance(found, dict):
         raise InputError(folder / "run.json", f"holds {type(found).__name__}", "expected what a verb wrote there")
-    return found
+    return with_real_inputs(found, folder)
 
 
 def read_dense_map(folder: str | Path) -> DenseMapFiles:

@@ -13,6 +13,7 @@ import io
 import os
 import sys
 from contextlib import suppress
+from contextvars import copy_context
 from functools import partial
 from importlib import metadata, util
 from pathlib import Path
@@ -38,6 +39,8 @@ from lightdepth.errors import (
 )
 
 GROUP = "lightdepth.commands"
+KEEP_NAMES = """Write the paths of inputs as they are into run.json, log and reports. Without it they are called by the
+option and a hash of their contents, as paths are often names of patients, and inputs.json alone has the paths."""
 ORDER = (
     "demo",
     "doctor",
@@ -68,7 +71,8 @@ def main(argv: list[str] | None = None) -> int:
     given = sys.argv[1:] if argv is None else argv
     try:
         with ending_on_signals(), outliving_readers(), warnings_as_sentences():
-            return _main(given)
+            # A run's own context: what one says of names does not hold for the next.
+            return copy_context().run(_main, given)
     except Interrupted as error:
         with suppress(OSError):  # the terminal may be what is gone
             print(f"lightdepth {given[0] if given else ''}: {error}", file=sys.stderr, flush=True)
@@ -148,12 +152,16 @@ def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     from lightdepth.command_line.parsing import parsed
     from lightdepth.command_line.presets import with_preset
     from lightdepth.files.replacing import check_apart
+    from lightdepth.reporting.names import KEPT
+    from lightdepth.reporting.own_settings import with_real_settings
 
     parser = verb_parser(function, verb)
-    argv = without_gone(verb, with_preset(verb, argv, partial(fail, parser)))
-    found = parsed(parser, argv)
+    given = with_preset(verb, argv, partial(fail, parser))
+    found = parsed(parser, without_gone(verb, with_real_settings(given)))
     if found.get("overwrite") and found.get("output"):
-        check_apart(Path(found["output"]), config_files(argv))
+        check_apart(Path(found["output"]), config_files(given))
+    if "keep_names" not in inspect.signature(function).parameters:
+        KEPT.set(bool(found.pop("keep_names", False)))
     return with_groups(function, parser.instantiate(found))
 
 
@@ -190,6 +198,8 @@ def verb_parser(function: Any, verb: str) -> Parser:
         parser.add_argument("--overwrite", action="store_true", help=said.get("overwrite"))
     if "no_frames" in parameters:
         parser.add_argument("--no_frames", action="store_true", help=said.get("no_frames"))
+    if "output" in parameters and "keep_names" not in parameters:
+        parser.add_argument("--keep_names", action="store_true", help=KEEP_NAMES)
     declared: set[str | int] = {name for name in ("output", "overwrite", "no_frames") if name in parameters}
     add_groups(parser, function)
     parser.add_function_arguments(

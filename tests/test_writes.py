@@ -17,6 +17,7 @@ MACHINERY = (
     "lightdepth/files/replacing.py",  # how a finished folder takes its place
     "lightdepth/files/lock.py",
     "lightdepth/reporting/run.py",  # the folder in the making: log.txt, config.yaml
+    "lightdepth/reporting/names.py",  # texts of the folder in the making, before run.json is
     "lightdepth/reporting/unfinished.py",  # what is kept of a run that can be resumed
 )
 _HIDDEN = "in a temporary folder that is hidden in the run folder in the making, whose models arrive by a rename"
@@ -45,7 +46,8 @@ ALLOWED = {
     "densify/dense_map.py: write": _RUN,
     "densify/densified.py: write": _RUN,
     "densify/exporting/work.py: export_maps": _RUN,
-    "train/commands/ablate.py: _ablate": "write_table uses write_whole",
+    "train/commands/ablate.py: _ablate": "write_table and write_inputs use write_whole",
+    "train/fit.py: fit": "write_inputs uses write_whole",
     "train/fit.py: __call__": "log.txt of a training, which grows while it lasts",
     "train/commands/adapt.py: _fit": _RUN,
 }

@@ -21,6 +21,7 @@ from typing import Annotated, Literal
 
 import lightning.pytorch as pl
 import torch
+import yaml
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import (
     EarlyStopping,
@@ -34,11 +35,13 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from lightdepth.checkpoint import load_model, save_model
 from lightdepth.errors import InputError
+from lightdepth.files.named_inputs import INPUTS, write_inputs
 from lightdepth.files.writing import write_whole
 from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
 from lightdepth.ranges import BELOW_ONE, at_least, checked
+from lightdepth.reporting.names import KEPT, Names, names_of
 from lightdepth.reporting.run import input_hash, versions, write_run_json
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
@@ -60,6 +63,7 @@ _OURS = (
         "model.md",
         "uncertainty.png",
     ),
+    INPUTS,
     "run.json",
 )
 _PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mixed")
@@ -139,11 +143,16 @@ def fit(
     if resumed is not None:
         load_model(resumed)  # says what is wrong with it before anything is touched
     data.setup()
-    echo = _Echo(output / "log.txt")
+    asked = {"settings": yaml.safe_load(config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
+    names = Names() if KEPT.get() else names_of(asked, (output,), argv=arguments or ())
+    echo = _Echo(output / "log.txt", names)
     if _first_process():
         output.mkdir(parents=True, exist_ok=True)
         for name in _OURS if overwrite else ("run.json",):
             _remove(output / name)
+        if names.paths:
+            write_inputs(output, names.paths)
+            config_yaml = yaml.safe_dump(names.hidden(asked["settings"], exactly=True), sort_keys=False)
         write_whole(output / "config.yaml", config_yaml)
     echo(
         f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
@@ -190,17 +199,17 @@ def fit(
         echo(f"exported the {chosen.stem} checkpoint to {output / 'model.safetensors'}")
         record = {
             "seed": seed,
-            "inputs": {path: input_hash(Path(path)) for path in [*data.sequences, *data.val_sequences]},
-            "split": data.split,
+            "inputs": {names.of(path): input_hash(Path(path)) for path in [*data.sequences, *data.val_sequences]},
+            "split": data.split and names.of(data.split),
             "frames": data.counts,
             "steps": steps,
             "resumed": resumed is not None,
             "units": {"rmse_mm": "mm", "medae_mm": "mm", "distance": "up to scale"},
             "errors": errors,
             "warnings": data.doubts,
-            "colour": {path: colours.record() for path, colours in data.colours.items()},
+            "colour": {names.of(path): colours.record() for path, colours in data.colours.items()},
         }
-        write_run_json(output, "train", {"argv": arguments or []}, started, record)
+        write_run_json(output, "train", {"argv": names.command(arguments or [])}, started, record, names)
     return errors
 
 
@@ -384,12 +393,12 @@ class _Echo:
 
     A class, not a closure, because it is pickled to worker processes."""
 
-    def __init__(self, log: Path) -> None:
-        self.log = log
+    def __init__(self, log: Path, names: Names) -> None:
+        self.log, self.names = log, names
 
     def __call__(self, line: str) -> None:
         if not _first_process():
             return
         print(line, file=sys.stderr, flush=True)
         with self.log.open("a", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(line + "\n")
+            file.write(self.names.text(line) + "\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from lightdepth.cli import KEEP_NAMES
 from lightdepth.command_line.pages import PAGES
 from lightdepth.ranges import SEED
 
@@ -39,6 +40,7 @@ def training_parser() -> Parser:
     parser.add_argument("-o", "--output", required=True, help=_OUTPUT)
     parser.add_argument("--resume", action="store_true", help=_RESUME)
     parser.add_argument("--overwrite", action="store_true", help=_OVERWRITE)
+    parser.add_argument("--keep_names", action="store_true", help=KEEP_NAMES)
     parser.add_argument("--seed", type=int, default=0, help=_SEED)
     parser.add_class_arguments(LightDepth, "model")
     parser.add_class_arguments(FrameData, "data")
@@ -59,7 +61,7 @@ def training_parser() -> Parser:
 def as_yaml(parser: ArgumentParser, config: Namespace) -> str:
     """The settings of a run, without where it goes and what becomes of what is there."""
     kept = config.clone()
-    for key in ("config", "preset", "output", "resume", "overwrite"):
+    for key in ("config", "preset", "output", "resume", "overwrite", "keep_names"):
         kept.pop(key, None)
     result: str = parser.dump(kept, skip_validation=True)
     return result

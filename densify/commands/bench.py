@@ -31,6 +31,7 @@ from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
 from lightdepth.models import DepthModel
 from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
+from lightdepth.reporting.names import told
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, git_revision, plain, recorded, run_folder, versions
 
@@ -153,7 +154,13 @@ def compare_runs(a: Path, b: Path, output: Path | None = None, seed: Annotated[i
     found = compare(read_bench(a), read_bench(b), seed)
     print(found.markdown(str(a), str(b)))
     if output is not None:
-        data = {"kind": "bench comparison", "a": a, "b": b, **asdict(found), "verdict": found.verdict}
+        data = {
+            "kind": "bench comparison",
+            "a": told(str(a), a=a),
+            "b": told(str(b), b=b),
+            **asdict(found),
+            "verdict": found.verdict,
+        }
         write_whole(output, json.dumps(plain(data), indent=1) + "\n")
 
 

@@ -14,6 +14,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
 from lightdepth.ranges import ANY, above, at_least
+from lightdepth.reporting.names import told
 from lightdepth.reporting.run import plain
 
 
@@ -63,7 +64,7 @@ def measure(
         assert frame is not None and pixels is not None
         places = places_in_frame(dense, frame, np.asarray(pixels, float).reshape(-1, 2))
     found = measured(dense, places, radius, mm_per_unit or 1.0)
-    result = {"run": str(run), "map": dense.id, "unit": unit, **found.record()}
+    result = {"run": told(str(run), run=run), "map": dense.id, "unit": unit, **found.record()}
     print(found.summary(unit))
     if output is not None:
         write_whole(output, json.dumps(plain(result), indent=1) + "\n")

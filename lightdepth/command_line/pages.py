@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_ALWAYS_RARE = ("print_config", "print_shtab", "map_sensor", "time_tolerance", "map_folder", "frame_offset")
+_ALWAYS_RARE = (
+    *("print_config", "print_shtab", "map_sensor", "time_tolerance", "map_folder", "frame_offset", "keep_names"),
+)
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ PAGES = {
             "lightdepth import video.mp4 -o report --rate 2 --start 60 --end 300 --no-frames",
         ),
         rare=("every", "deinterlace", "find_text", "blur", "max_frames"),
+        more=("keep_names",),
     ),
     "calibrate-light": Page(
         (

@@ -20,6 +20,7 @@ from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.light.report import light_page
 from lightdepth.ranges import SEED, Range
+from lightdepth.reporting.names import told
 
 
 def calibrate_light(
@@ -72,5 +73,11 @@ def calibrate_light(
         check_pairing(sparse_map, frames, pairing, given=given)
         fit = fit_on_map(frames, sparse_map, camera=given, rng=rng)
         what = f"{data}, {sparse_map.source}"
-    write_together({page_path: light_page(fit, what).write, output: lambda path: write_light(fit.light, path)})
+    page = light_page(fit, told(what, data=data, map=map))
+    write_together(
+        {
+            page_path: page.write,
+            output: lambda path: write_light(fit.light, path),
+        }
+    )
     print(f"light: {fit.summary()}\n{output}, {page_path}")

@@ -68,7 +68,7 @@ def import_frames(
     if not keep_names:
         paths = [name for name in (*source.files, "overlay_mask") if arguments[name] is not None]
         arguments |= {name: "(name left out)" for name in paths if "=" not in str(arguments[name])}
-    with run_folder(output, "import", arguments, overwrite, resume, inputs=(source, overlay_mask)) as run:
+    with run_folder(output, "import", arguments, overwrite, resume, (source, overlay_mask), keep_names) as run:
         calibrated, found_camera = with_camera(source, run)
         opened, files = open_source(calibrated)
         run.check_inputs(**source.files, overlay_mask=overlay_mask)

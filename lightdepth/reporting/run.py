@@ -22,6 +22,7 @@ from typing import Any, TextIO
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.lock import locked
 from lightdepth.files.machine import machine_failure
+from lightdepth.files.named_inputs import write_inputs
 from lightdepth.files.replacing import (
     BEGUN,
     PARTS,
@@ -38,6 +39,7 @@ from lightdepth.files.replacing import (
     unfinished_path,
 )
 from lightdepth.files.writing import sync_below, write_whole
+from lightdepth.reporting.names import KEPT, Names, names_of
 from lightdepth.reporting.same import check_finished, check_same, compared
 from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
@@ -66,6 +68,9 @@ PACKAGES = (
 )
 
 
+_NO_NAMES = Names()
+
+
 class Run:
     """An output folder in the making. `folder` is where to write, `output` what it becomes; `record` is what run.json
     will say besides."""
@@ -84,7 +89,10 @@ class Run:
         self.resumed = bool(parts)
         self._told: set[str] = set()  # finished parts whose reports are in the record
         self._begun: dict[str, tuple[int, int]] = {}  # failures and warnings when a part began: parts may lie in parts
-        self._verb, self._arguments, self._start = verb, plain(arguments), time.time()
+        self._verb, self._given, self._start = verb, arguments, time.time()
+        self._arguments = plain(arguments)
+        self.keep_names = False
+        self.unlisted: Mapping[str, Any] = {}  # inputs that do not stand among the arguments
 
     @property
     def resumable(self) -> bool:
@@ -198,13 +206,29 @@ class Run:
         finally:
             warnings.showwarning = shown
 
+    def names(self) -> Names:
+        """What the inputs are called in the run's files; no names where paths are kept."""
+        if self.keep_names:
+            return Names()
+        hashed = {
+            known["path"]: known["sha256"] for known in (self.record.get("inputs") or {}).values() if "path" in known
+        }
+        argv = () if "command" in self.record else sys.argv
+        return names_of(self._given, (self.output, self.folder), self.unlisted, argv, hashed)
+
     def finish(self) -> None:
         import yaml
 
         discard(self.state)
-        (self.folder / "config.yaml").write_text(yaml.safe_dump(self._arguments, sort_keys=False), encoding="utf-8")
+        names = self.names()
+        settings = yaml.safe_dump(names.hidden(self._arguments, exactly=True), sort_keys=False)
+        (self.folder / "config.yaml").write_text(settings, encoding="utf-8")
+        names.hide_below(self.folder)
+        if names.paths:
+            write_inputs(self.folder, names.paths)
+        self.folder.chmod(0o755)
         sync_below(self.folder)  # run.json says that the rest is whole: it comes last
-        write_run_json(self.folder, self._verb, self._arguments, self._start, self.record)
+        write_run_json(self.folder, self._verb, self._arguments, self._start, self.record, names)
         for name in (BEGUN, PARTS):
             (self.folder / name).unlink(missing_ok=True)
 
@@ -223,14 +247,15 @@ def run_folder(
     overwrite: bool = False,
     resume: bool | None = None,
     inputs: Sequence[object] = (),
+    keep_names: bool | None = None,
 ) -> Iterator[Run]:
     """A Run whose folder becomes `output` when the block ends well.
 
     `resume` None: a verb that cannot be resumed; what it wrote goes when the block fails. Else finished parts
     (`Run.finish_part`) are kept when it is killed or the machine fails, and `resume` True goes on from them. `inputs`
-    are those that do not stand among the arguments, which are looked through for others. Raises
-    InputError when `output` is in use, is or holds an input, or holds what is not of such a run; AlreadyFinished;
-    MachineFailure, with what was kept.
+    are those that do not stand among the arguments, which are looked through for others. `keep_names` writes paths as
+    they are; None: as the command line says. Raises InputError when `output` is in use, is or holds an input, or holds
+    what is not of such a run; AlreadyFinished; MachineFailure, with what was kept.
     """
     if resume and overwrite:
         raise InputError("--resume, --overwrite", "they contradict each other", "give one of them")
@@ -240,6 +265,8 @@ def run_folder(
         with _parents(real), locked(real):
             run = _begun(real, verb, arguments, overwrite, resume, [*paths_in(arguments), *paths_in(inputs)])
             before = stamp(real)
+            run.keep_names = KEPT.get() if keep_names is None else keep_names
+            run.unlisted = {"input": inputs}
             with _kept_or_gone(run, real, resume is not None), run.hearing():
                 yield run
                 run.finish()
@@ -312,8 +339,8 @@ def _begun(
         run = Run(made, output, verb, arguments, parts)
         run.log(f"resumed: {len(parts)} finished part(s) are kept")
         return run
-    made.mkdir(mode=0o755)
-    made.chmod(0o755)
+    made.mkdir(mode=0o700)
+    made.chmod(0o700)  # until it is finished its files name the inputs
     begin(made, {"verb": verb, "arguments": compared(arguments), "inputs": {}})
     return Run(made, output, verb, arguments, {} if resume is not None else None)
 
@@ -341,19 +368,26 @@ def _kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
 
 
 def write_run_json(
-    folder: Path, verb: str, arguments: Mapping[str, Any], start: float, record: Mapping[str, Any]
+    folder: Path,
+    verb: str,
+    arguments: Mapping[str, Any],
+    start: float,
+    record: Mapping[str, Any],
+    names: Names = _NO_NAMES,
 ) -> None:
-    """run.json, by rename, so that its presence means that the run is complete. `start` as of time.time()."""
+    """run.json, by rename, so that its presence means that the run is complete. `start` as of time.time(); `names` are
+    what inputs are called in it."""
+    told = plain(record)
     data = {
         "verb": verb,
-        "arguments": plain(arguments),
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "arguments": names.hidden(plain(arguments), exactly=True),
+        "command": names.command([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "versions": versions(),
         "revision": git_revision(),
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start)),
         "seconds": round(time.time() - start, 3),
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
-        **plain(record),
+        **{key: names.hidden(value, exactly=key == "inputs") for key, value in told.items()},
         "files": listed(folder),
     }
     write_whole(folder / "run.json", json.dumps(data, indent=1) + "\n")

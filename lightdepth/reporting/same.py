@@ -12,6 +12,7 @@ from typing import Any
 
 from lightdepth.errors import AlreadyFinished, InputError
 from lightdepth.files.below import files_below
+from lightdepth.files.named_inputs import INPUTS, TOKEN, with_real_inputs
 from lightdepth.files.replacing import read_record
 
 
@@ -20,7 +21,7 @@ def check_finished(output: Path, verb: str, arguments: Mapping[str, Any]) -> Non
     record = read_record(output)
     if record is None:
         raise InputError(output, "not resumed, it holds no run of this program", "choose another -o")
-    check_same(output, record, verb, arguments)
+    check_same(output, with_real_inputs(record, output), verb, arguments)
     raise AlreadyFinished(f"{output.name} is already finished")
 
 
@@ -31,6 +32,9 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
     now, then = compared(arguments), compared(begun.get("arguments") or {})
     for name in dict.fromkeys([*now, *then]):
         if now.get(name) != then.get(name):
+            if isinstance(then.get(name), str) and TOKEN.fullmatch(then[name]):
+                found = f"not resumed, {INPUTS} is gone, which says what {then[name]} is"
+                raise InputError(output, found, "choose another -o, or give --overwrite")
             found = f"not resumed, --{name.replace('_', '-')} was {then.get(name)!r} and is {now.get(name)!r}"
             raise InputError(output, found, "give the same options, or --overwrite to start anew")
     for name, known in (begun.get("inputs") or {}).items():
@@ -39,9 +43,12 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
             raise InputError(output, f"not resumed, {name} has changed since", "--overwrite starts anew")
 
 
+_NOT_COMPARED = ("output", "overwrite", "resume", "keep_names")
+
+
 def compared(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """The arguments that decide what comes out, as JSON reads them back."""
-    chosen = {name: value for name, value in arguments.items() if name not in ("output", "overwrite", "resume")}
+    chosen = {name: value for name, value in arguments.items() if name not in _NOT_COMPARED}
     same: dict[str, Any] = json.loads(json.dumps(plain(chosen)))
     return same
 

@@ -19,6 +19,7 @@ from typing import Annotated
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files import replacing
 from lightdepth.files.lock import locked
+from lightdepth.files.named_inputs import INPUTS, write_inputs
 from lightdepth.files.replacing import (
     check_replaceable,
     check_rewritable,
@@ -29,6 +30,7 @@ from lightdepth.files.replacing import (
     unfinished_path,
 )
 from lightdepth.ranges import SEED
+from lightdepth.reporting.names import KEPT, Names, names_of
 from lightdepth.reporting.run import recorded, write_run_json
 from lightdepth.reporting.same import paths_in
 from lightdepth.reporting.unfinished import begin
@@ -41,7 +43,7 @@ from ..ablation.table import HEADING, AblationTable, Result, write_table
 from ..parser import training_parser
 from ..running import quiet
 
-_OURS = ("ablation.md", "ablation.csv", "ablation.json", "run.json")
+_OURS = ("ablation.md", "ablation.csv", "ablation.json", INPUTS, "run.json")
 
 
 def ablate(
@@ -145,5 +147,8 @@ def _ablate(
     write_table(made, output, table)
     failed = [r for r in made.results if r.failed]
     record = {"trainings": len(plans), "failures": [{"what": f"{r.row}, {r.seed}", "reason": r.failed} for r in failed]}
-    write_run_json(output, "ablate", arguments, started, record)
+    names = Names() if KEPT.get() else names_of(arguments, (output,))
+    if names.paths:
+        write_inputs(output, names.paths)
+    write_run_json(output, "ablate", arguments, started, record, names)
     return failed

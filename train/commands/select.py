@@ -27,6 +27,7 @@ from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
 from lightdepth.ranges import Range, checked
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
+from lightdepth.reporting.names import told
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.report import Report
 from lightdepth.sparse_map import SparseMap
@@ -134,11 +135,18 @@ def select(
         )
     summary = f"{sum(v.kept for v in verdicts)} of {len(verdicts)} frames kept; rejected: {_counts(verdicts)}"
     folder = f"{data.resolve().name}/" if with_folder else ""
-    header = [f"{data}: {summary}", how, *(f"{name}: {value}" for name, value in settings.items() if value is not None)]
+    shown = told(str(data), data=data, map=map)
+    settings = {name: told(v, data=data, map=map) if isinstance(v, str) else v for name, v in settings.items()}
+    how, doubts = told(how, data=data, map=map), tuple(told(doubt, data=data, map=map) for doubt in doubts)
+    header = [
+        f"{shown}: {summary}",
+        how,
+        *(f"{name}: {value}" for name, value in settings.items() if value is not None),
+    ]
     listed = [f"# {' '.join(line.split())}" for line in header] + [f"{folder}{v.name}" for v in verdicts if v.kept]
 
     picture = None if no_frames else _sheet(frames, verdicts)
-    page = _page(data, summary, how, settings, verdicts, picture, doubts)
+    page = _page(shown, summary, how, settings, verdicts, picture, doubts)
     writers: dict[Path, Content] = {
         paths["table"]: _table(verdicts),
         paths["page"]: page.write,
@@ -202,7 +210,7 @@ def _sheet(frames: FrameSequence, verdicts: Sequence[FrameVerdict]) -> bytes:
 
 
 def _page(
-    data: Path,
+    data: str,
     summary: str,
     how: str,
     settings: dict[str, object],

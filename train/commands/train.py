@@ -14,6 +14,8 @@ from lightdepth.command_line.gone_settings import without_gone
 from lightdepth.command_line.mistakes import fail
 from lightdepth.command_line.parsing import parsed
 from lightdepth.command_line.presets import with_preset
+from lightdepth.reporting.names import KEPT
+from lightdepth.reporting.own_settings import with_real_settings
 
 from ..datamodule import FrameDataModule
 from ..fit import check_output, fit
@@ -28,8 +30,11 @@ def train(argv: list[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if argv is None else argv)
     parser = training_parser()
-    argv = without_gone("train", _with_own_config(with_preset("train", given, partial(fail, parser))))
+    argv = without_gone(
+        "train", with_real_settings(_with_own_config(with_preset("train", given, partial(fail, parser))))
+    )
     config = parsed(parser, argv)
+    KEPT.set(config.keep_names)
 
     output = Path(config.output)
     check_output(output, config.resume, config.overwrite)  # before the seconds that the rest takes
