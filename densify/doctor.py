@@ -18,7 +18,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.lock import locked
 from lightdepth.files.replacing import hidden, output_of, recover, remains
 from lightdepth.prediction import DepthPrediction
-from lightdepth.reporting.run import versions
+from lightdepth.reporting.record import versions
 
 _MOST_FOLDERS = 200
 """Folders in the current one in which remains of killed runs are looked for."""

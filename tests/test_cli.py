@@ -326,7 +326,7 @@ def test_an_existing_output_is_refused_unless_told_and_never_when_it_is_not_ours
     before = (tmp_path / "out" / "run.json").read_bytes()
     argv = ["densify", data, "--map", data / "slam", "--checkpoint", "decline", "--judge.on", "false"]
     assert lightdepth(*argv, "-o", tmp_path / "out") == 3
-    assert "already there and not empty; choose another -o, or give --overwrite" in capsys.readouterr().err
+    assert "already there and not empty; choose another -o, or give --resume or --overwrite" in capsys.readouterr().err
     assert (tmp_path / "out" / "run.json").read_bytes() == before
     assert lightdepth(*argv, "-o", tmp_path / "out", "--overwrite") == 0
     assert json.loads((tmp_path / "out" / "run.json").read_text())["arguments"]["judge"]["on"] is False

@@ -23,7 +23,8 @@ from lightdepth.files.below import files_below, given, is_result
 from lightdepth.files.lock import is_live, lock_path, locked
 from lightdepth.files.replacing import check_rewritable, old_path, remains, unfinished_path
 from lightdepth.files.writing import write_whole
-from lightdepth.reporting.run import input_hash, paths_in, run_folder, write_run_json
+from lightdepth.reporting.record import write_run_json
+from lightdepth.reporting.run import input_hash, paths_in, run_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 

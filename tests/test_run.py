@@ -16,7 +16,8 @@ from raising import refused
 
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.reporting.progress import Progress
-from lightdepth.reporting.run import git_revision, input_hash, plain, run_folder, versions, write_run_json
+from lightdepth.reporting.record import git_revision, versions, write_run_json
+from lightdepth.reporting.run import input_hash, plain, run_folder
 
 
 def make(output: Path, text: str = "new", **given) -> None:

@@ -42,7 +42,8 @@ from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
 from lightdepth.ranges import BELOW_ONE, at_least, checked
 from lightdepth.reporting.names import KEPT, Names, names_of
-from lightdepth.reporting.run import input_hash, versions, write_run_json
+from lightdepth.reporting.record import versions, write_run_json
+from lightdepth.reporting.run import input_hash
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
 from .callbacks import Diagnosis, DiagnosisConfig, Panels, TrainingProgress, validation_line

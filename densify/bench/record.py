@@ -18,7 +18,8 @@ from densify.bench.work import INLIERS, SPARSE, BenchConfig
 from densify.evaluation.tables import Table
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
-from lightdepth.reporting.run import git_revision, plain, versions
+from lightdepth.reporting.record import git_revision, versions
+from lightdepth.reporting.run import plain
 
 COLUMNS = {
     "points": "#MP (×10³)",

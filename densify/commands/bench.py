@@ -33,7 +33,8 @@ from lightdepth.models import DepthModel
 from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
 from lightdepth.reporting.names import told
 from lightdepth.reporting.progress import Progress
-from lightdepth.reporting.run import Run, git_revision, plain, recorded, run_folder, versions
+from lightdepth.reporting.record import git_revision, versions
+from lightdepth.reporting.run import Run, plain, recorded, run_folder
 
 
 def bench(argv: list[str]) -> int:

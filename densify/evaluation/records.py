@@ -14,7 +14,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from densify.judging.withheld import WithheldOfMap
-from lightdepth.reporting.run import git_revision, plain, versions
+from lightdepth.reporting.record import git_revision, versions
+from lightdepth.reporting.run import plain
 
 
 def with_versions(record: Mapping[str, Any]) -> dict[str, Any]:

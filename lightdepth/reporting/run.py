@@ -6,16 +6,11 @@ files. A verb that fails leaves OUT as it was; one that can be resumed keeps its
 
 from __future__ import annotations
 
-import json
-import platform
-import resource
-import subprocess
 import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -30,7 +25,6 @@ from lightdepth.files.replacing import (
     check_apart,
     check_replaceable,
     discard,
-    listed,
     real_output,
     recover,
     replace,
@@ -38,8 +32,9 @@ from lightdepth.files.replacing import (
     try_place,
     unfinished_path,
 )
-from lightdepth.files.writing import sync_below, write_whole
+from lightdepth.files.writing import sync_below
 from lightdepth.reporting.names import KEPT, Names, names_of
+from lightdepth.reporting.record import write_run_json
 from lightdepth.reporting.same import check_finished, check_same, compared
 from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
@@ -53,22 +48,6 @@ from lightdepth.reporting.unfinished import (
     finished_parts,
     new_files,
 )
-
-PACKAGES = (
-    "lightdepth",
-    "torch",
-    "lightning",
-    "kornia",
-    "numpy",
-    "scipy",
-    "open3d",
-    "open3d-cpu",
-    "pycolmap",
-    "opencv-python-headless",
-)
-
-
-_NO_NAMES = Names()
 
 
 class Run:
@@ -365,55 +344,3 @@ def _kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
         if failure is not None:
             raise failure from error
         raise
-
-
-def write_run_json(
-    folder: Path,
-    verb: str,
-    arguments: Mapping[str, Any],
-    start: float,
-    record: Mapping[str, Any],
-    names: Names = _NO_NAMES,
-) -> None:
-    """run.json, by rename, so that its presence means that the run is complete. `start` as of time.time(); `names` are
-    what inputs are called in it."""
-    told = plain(record)
-    data = {
-        "verb": verb,
-        "arguments": names.hidden(plain(arguments), exactly=True),
-        "command": names.command([Path(sys.argv[0]).name, *sys.argv[1:]]),
-        "versions": versions(),
-        "revision": git_revision(),
-        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start)),
-        "seconds": round(time.time() - start, 3),
-        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
-        **{key: names.hidden(value, exactly=key == "inputs") for key, value in told.items()},
-        "files": listed(folder),
-    }
-    write_whole(folder / "run.json", json.dumps(data, indent=1) + "\n")
-
-
-def versions() -> dict[str, str]:
-    """Installed versions of Python and of the packages that results depend on."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
-
-
-def git_revision() -> str | None:
-    """Revision of the program's own checkout ("+" with uncommitted changes), or None outside one."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return None
-    try:
-        call = {"cwd": root, "capture_output": True, "text": True, "timeout": 10, "check": True}
-        revision = subprocess.run(["git", "rev-parse", "HEAD"], **call).stdout.strip()  # type: ignore[call-overload]  # options by name
-        changed = subprocess.run(["git", "status", "--porcelain", "-uno"], **call).stdout.strip()  # type: ignore[call-overload]  # options by name
-    except (OSError, subprocess.SubprocessError):
-        return None
-    result: str | None = revision + ("+" if changed else "")
-    return result

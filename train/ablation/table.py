@@ -20,7 +20,7 @@ from typing import TypedDict
 import numpy as np
 
 from lightdepth.files.writing import write_whole
-from lightdepth.reporting.run import git_revision
+from lightdepth.reporting.record import git_revision
 
 from ..colons import TubeData, colon_seeds
 from .rows import JudgedColons, Row

@@ -31,7 +31,8 @@ from lightdepth.files.replacing import (
 )
 from lightdepth.ranges import SEED
 from lightdepth.reporting.names import KEPT, Names, names_of
-from lightdepth.reporting.run import recorded, write_run_json
+from lightdepth.reporting.record import write_run_json
+from lightdepth.reporting.run import recorded
 from lightdepth.reporting.same import paths_in
 from lightdepth.reporting.unfinished import begin
 

@@ -23,7 +23,8 @@ from lightdepth.detective import PairingConfig
 from lightdepth.errors import InputError
 from lightdepth.models import DeclineModel, NetworkModel, working_size
 from lightdepth.reporting.kept import kept
-from lightdepth.reporting.run import Run, plain, recorded, run_folder, versions
+from lightdepth.reporting.record import versions
+from lightdepth.reporting.run import Run, plain, recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
 
 from ..adapting.card import AdaptedCard, target_loss
