@@ -132,7 +132,7 @@ def all_settings() -> list[type]:
     from lightdepth.losses import LossConfig
     from lightdepth.network import NetworkConfig
     from train.datamodule import FrameData
-    from train.fit import FitConfig
+    from train.watching import FitConfig
 
     found = [EstimatorsConfig, BenchConfig, LossConfig, NetworkConfig, FrameData, FitConfig]
     for entry in metadata.entry_points(group="lightdepth.commands"):

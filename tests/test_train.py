@@ -119,10 +119,11 @@ def test_a_resumed_run_goes_on_from_its_step_with_its_own_configuration(finished
     assert "resuming from last.ckpt" in log and "step 30/30" in log
 
 
-def test_a_damaged_checkpoint_is_not_resumed_and_the_run_stays_as_it_was(finished_run, tmp_path):
+def test_damaged_checkpoints_are_not_resumed_and_the_run_stays_as_it_was(finished_run, tmp_path):
     run = tmp_path / "damaged"
     shutil.copytree(finished_run, run)
-    (run / "checkpoints" / "last.ckpt").write_bytes(b"damaged")
+    for checkpoint in (run / "checkpoints").iterdir():
+        checkpoint.write_bytes(b"damaged")
     with refused(where="last.ckpt"):
         train(["-o", str(run), "--resume"])
     assert (run / "run.json").is_file()

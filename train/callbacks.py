@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -120,6 +120,12 @@ class Diagnosis(pl.Callback):
         self.skipped = 0
         self._row: Counter[str] = Counter()
         self._bad = ""
+
+    def state_dict(self) -> dict[str, object]:
+        return {"skipped": self.skipped, "row": dict(self._row)}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        self.skipped, self._row = int(state_dict["skipped"]), Counter(state_dict["row"])
 
     def on_train_batch_start(
         self, trainer: pl.Trainer, module: pl.LightningModule, batch: FrameBatch, batch_idx: int

@@ -133,6 +133,11 @@ class FrameDataModule(pl.LightningDataModule):
         check_apart(self.sequences, self.val_sequences)
         self._train: ConcatDataset[FrameBatch] | None = None
         self._val: ConcatDataset[FrameBatch] | None = None
+        self._begun = (0, 0)
+
+    def go_on(self, epoch: int, batch: int) -> None:
+        """A run that is resumed begins with this batch of this epoch."""
+        self._begun = epoch, batch
 
     def setup(self, stage: str | None = None) -> None:
         if self._train is not None:
@@ -235,7 +240,7 @@ class FrameDataModule(pl.LightningDataModule):
         order.set_epoch(epoch)
         everyone = [name for part in self._train.datasets for name in part.names]  # type: ignore[attr-defined]  # ours have
         first = batch * self.batch_size
-        return [everyone[i] for i in list(order)[first : first + self.batch_size]]
+        return [everyone[i] for i in order.rows()[first : first + self.batch_size]]
 
     def _order(self) -> Shuffled:
         assert self._train is not None
@@ -248,6 +253,10 @@ class FrameDataModule(pl.LightningDataModule):
     def train_dataloader(self) -> DataLoader[FrameBatch]:
         assert self._train is not None
         sampler = self._order()
+        epoch, batch = self._begun
+        # Of several processes each takes its share of all rows: there an epoch that was broken off begins anew.
+        alone = self.trainer is None or self.trainer.world_size == 1
+        sampler.go_on(epoch, batch * self.batch_size if alone else 0)
         full = len(self._train) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
         return self._loader(self._train, sampler, drop_last=full)
 

@@ -1,7 +1,7 @@
 """The training run: a model, its data and a folder in; checkpoints, an exported model and a record of the run out.
 
-OUT/  config.yaml  log.txt  tensorboard/  checkpoints/{last,best}.ckpt  model.safetensors  model.md  run.json
-      uncertainty.png (where the network has that head, and validation frames have truth)
+OUT/  config.yaml  log.txt  tensorboard/  checkpoints/{last,last-previous,best}.ckpt  model.safetensors  model.md
+      run.json  uncertainty.png (where the network has that head, and validation frames have truth)
 
 `best` is the lowest validation criterion, which needs no truth. run.json is written last, by rename: its presence means
 the run is complete.
@@ -10,104 +10,47 @@ the run is complete.
 from __future__ import annotations
 
 import math
-import shutil
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
 import lightning.pytorch as pl
 import torch
 import yaml
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import (
-    EarlyStopping,
-    EMAWeightAveraging,
-    LearningRateMonitor,
-    ModelCheckpoint,
-    RichProgressBar,
-)
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from lightning.pytorch.utilities import rank_zero_only
 
 from lightdepth.checkpoint import load_model, save_model
-from lightdepth.errors import InputError
-from lightdepth.files.named_inputs import INPUTS, write_inputs
-from lightdepth.files.writing import write_whole
+from lightdepth.command_line.signals import finishing_first
+from lightdepth.errors import InputError, Interrupted
+from lightdepth.files.named_inputs import write_inputs
+from lightdepth.files.replacing import output_of, read_record, unfinished_path
+from lightdepth.files.writing import sync_below, write_whole
 from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
-from lightdepth.ranges import BELOW_ONE, at_least, checked
 from lightdepth.reporting.names import KEPT, Names, names_of
 from lightdepth.reporting.record import versions, write_run_json
 from lightdepth.reporting.run import input_hash
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
-from .callbacks import Diagnosis, DiagnosisConfig, Panels, TrainingProgress, validation_line
+from .callbacks import validation_line
 from .card import Card, Doubt
+from .checkpoints import BEST, LAST, Start, newest
 from .colons import TubeData
 from .datamodule import FrameDataModule
-from .running import quiet, report_every
+from .folder import begin_in, first_process, has_checkpoint, training_folder
+from .requeue import requeued
+from .running import quiet
 from .trainer_options import check_trainer_options
+from .watching import Echo, FitConfig
+from .watching import with_callbacks as _with_callbacks
 
-_OURS = (
-    *(
-        "config.yaml",
-        "log.txt",
-        "tensorboard",
-        "csv",
-        "checkpoints",
-        "model.safetensors",
-        "model.md",
-        "uncertainty.png",
-    ),
-    INPUTS,
-    "run.json",
-)
 _PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mixed")
 
 
-@dataclass(frozen=True)
-@checked
-class FitConfig:
-    """How a run is watched, averaged and stopped."""
-
-    ema: Annotated[float, BELOW_ONE] = 0.0
-    """Decay of the running average of the weights, in [0, 1), which is validated and exported in place of the last
-    weights; 0 takes no average. A larger one averages over more steps, about 1 / (1 - decay) of them."""
-    monitor: Literal["loss", "photometric", "inconsistency", "last"] = "loss"
-    """What must be least, on the validation frames, in the checkpoint that is exported; it needs no truth: the whole
-    "loss"; its "photometric" term (rendered against seen light); or the "inconsistency" (how much distance changes when
-    the image is mirrored and darkened). "last" exports the last step, whatever these say."""
-    patience: Annotated[int, at_least(0)] = 0
-    """Number of validations in a row without a better value of --fit.monitor after which the run ends; 0 goes on to the
-    last step. More wait longer."""
-    diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
-    """When a run that goes nowhere is stopped."""
-
-    def __post_init__(self) -> None:
-        if self.patience and self.monitor == "last":
-            raise InputError(
-                "fit", "patience without a criterion", "set fit.monitor to loss, photometric or inconsistency"
-            )
-
-
 _FIT = FitConfig()
-
-
-def check_output(output: Path, resume: bool, overwrite: bool) -> None:
-    """Raises InputError when the folder holds a run and neither flag says what to do with it."""
-    if resume and overwrite:
-        raise InputError("--resume, --overwrite", "they contradict each other", "give one of them")
-    if output.exists() and not output.is_dir():
-        raise InputError(output, "is a file", "expected a folder to write the run to")
-    complete, begun = (output / "run.json").exists(), (output / "checkpoints" / "last.ckpt").exists()
-    if (complete or begun) and not resume and not overwrite:
-        state = "complete" if complete else "unfinished"
-        raise InputError(output, f"holds a {state} run", "--resume continues it, --overwrite starts anew")
 
 
 def fit(
@@ -121,12 +64,14 @@ def fit(
     overwrite: bool = False,
     arguments: list[str] | None = None,
     settings: FitConfig = _FIT,
+    inputs: Sequence[Path] = (),
 ) -> dict[str, float]:
     """Trains, exports, records; returns the errors of the exported model on the validation frames.
 
     `trainer_options` are lightning's Trainer's; a logger among them takes the place of TensorBoard. With `resume` the
-    run goes on from checkpoints/last.ckpt, if there is one. Raises InputError, and leaves the folder as it is, when it
-    holds a run and neither `resume` nor `overwrite` is given, or when data or checkpoint cannot be read.
+    run goes on from the newest checkpoint that reads, if there is one. `inputs` are not overwritten. Raises InputError,
+    and leaves the folder as it is, when it holds a run and neither `resume` nor `overwrite` is given, or when data or
+    checkpoint cannot be read; Interrupted on a signal, when the step is finished and a checkpoint written.
     """
     if trainer_options.get("precision") not in _PRECISIONS:
         raise InputError(
@@ -135,83 +80,146 @@ def fit(
             "expected 32-true, 16-mixed or bf16-mixed",
         )
     check_trainer_options(trainer_options)
-    check_output(output, resume, overwrite)
-    started = time.time()
     quiet()
-    checkpoints = output / "checkpoints"
-    last = checkpoints / "last.ckpt"
-    resumed = last if resume and last.exists() else None
-    if resumed is not None:
-        load_model(resumed)  # says what is wrong with it before anything is touched
+    job = _Job(config_yaml, seed, arguments or [], settings, resume)
+    try:
+        with training_folder(output, resume, overwrite, inputs) as folder:
+            start = newest(folder / "checkpoints") if resume else None
+            return _fitted(model, data, folder, trainer_options, job, start)
+    except Interrupted as error:
+        left = error.kept or _left(output, resume or overwrite)
+        error.kept = ". ".join(filter(None, (left, requeued(error.signal))))
+        raise
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What a run was asked for, besides its model, data and Trainer."""
+
+    config_yaml: str
+    seed: int
+    arguments: list[str]
+    settings: FitConfig
+    resume: bool
+
+
+def _fitted(
+    model: LightDepth,
+    data: FrameDataModule,
+    folder: Path,
+    trainer_options: Mapping[str, object],
+    job: _Job,
+    start: Start | None,
+) -> dict[str, float]:
+    started = time.time()
     data.setup()
-    asked = {"settings": yaml.safe_load(config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
-    names = Names() if KEPT.get() else names_of(asked, (output,), argv=arguments or ())
-    echo = _Echo(output / "log.txt", names)
-    if _first_process():
-        output.mkdir(parents=True, exist_ok=True)
-        for name in _OURS if overwrite else ("run.json",):
-            _remove(output / name)
+    asked = {"settings": yaml.safe_load(job.config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
+    output = output_of(folder) or folder
+    names = Names() if KEPT.get() else names_of(asked, (output, folder), argv=job.arguments)
+    echo = Echo(folder / "log.txt", names)
+    if first_process():
+        begin_in(folder)
+        settings = job.config_yaml
         if names.paths:
-            write_inputs(output, names.paths)
-            config_yaml = yaml.safe_dump(names.hidden(asked["settings"], exactly=True), sort_keys=False)
-        write_whole(output / "config.yaml", config_yaml)
+            write_inputs(folder, names.paths)
+            settings = yaml.safe_dump(names.hidden(asked["settings"], exactly=True), sort_keys=False)
+        write_whole(folder / "config.yaml", settings)
     echo(
         f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
     )
     for sentence in data.doubts:
         echo(f"warning: {sentence}")
-    options = _with_callbacks(trainer_options, output, echo, data, settings)
-    with _refusals_named(MisconfigurationException, ValueError, TypeError):
-        trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the parser checked them against Trainer
-    if resume:
-        echo(f"resuming from {last.name}" if resumed else "nothing to resume: starting anew")
-    with _refusals_named(MisconfigurationException):
-        trainer.fit(model, datamodule=data, ckpt_path=resumed, weights_only=True)
-    train_loss = trainer.callback_metrics.get("train/loss")
+    checkpoints = folder / "checkpoints"
+    with finishing_first() as received:
+        options = _with_callbacks(trainer_options, folder, echo, data, job.settings, received, start)
+        with _refusals_named(MisconfigurationException, ValueError, TypeError):
+            trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the parser checked them against Trainer
+        if job.resume:
+            echo(start.said if start else "nothing to resume: starting anew")
+        if start is not None:
+            data.go_on(start.epoch, start.batch)
+            _warn_of_length(echo, model, start, trainer.max_steps)
+        with _refusals_named(MisconfigurationException):
+            path = None if start is None else start.path
+            trainer.fit(model, datamodule=data, ckpt_path=path, weights_only=True)
+        train_loss = trainer.callback_metrics.get("train/loss")
+        received.stop(f"all steps are kept in {LAST}: --resume exports the model")
 
-    best = checkpoints / "best.ckpt"
-    chosen = best if best.exists() else last
+    chosen = checkpoints / (BEST if (checkpoints / BEST).exists() else LAST)
     found = trainer.validate(model, datamodule=data, ckpt_path=chosen, verbose=False, weights_only=True)[0]
     errors = {key.removeprefix("val/"): float(value) for key, value in found.items()}
     if trainer.is_global_zero:
         final = f"train loss {float(train_loss):.4g}  " if train_loss is not None else ""
         echo(f"final: {final}{validation_line(found)}")
-        exported = load_model(chosen)  # not `model`: where weights are averaged, the file has the average
-        assert isinstance(exported, NetworkModel)
-        doubt = _calibrate(exported.network, data, output) if model.loss_config.uncertainty > 0 else None
-        # Not the trainer's step: of processes started for the fit alone, it never hears.
-        steps = int(torch.load(last, map_location="cpu", weights_only=True)["global_step"])
-        card = TrainedCard(
-            trained_on=_trained_on(model, data),
-            rows=model.rows,
-            steps=steps,
-            seed=seed,
-            checkpoint=chosen.stem,
-            network=model.network.config,
-            loss=model.loss_config,
-            fit=settings,
-            uncertainty=doubt,
-            tube=data.tube if data.tube.scenes or data.tube.val_scenes else None,
-            errors=errors,
-            version=versions().get("lightdepth", "not installed"),
-        )
-        save_model(exported.network, output / "model.safetensors", card.record())
-        write_whole(output / "model.md", card.text(output.name))
-        echo(f"exported the {chosen.stem} checkpoint to {output / 'model.safetensors'}")
-        record = {
-            "seed": seed,
-            "inputs": {names.of(path): input_hash(Path(path)) for path in [*data.sequences, *data.val_sequences]},
-            "split": data.split and names.of(data.split),
-            "frames": data.counts,
-            "steps": steps,
-            "resumed": resumed is not None,
-            "units": {"rmse_mm": "mm", "medae_mm": "mm", "distance": "up to scale"},
-            "errors": errors,
-            "warnings": data.doubts,
-            "colour": {names.of(path): colours.record() for path, colours in data.colours.items()},
-        }
-        write_run_json(output, "train", {"argv": names.command(arguments or [])}, started, record, names)
+        record = _exported(model, data, folder, chosen, errors, job, echo)
+        sync_below(folder)  # run.json says that the rest is whole
+        record["resumed"] = start is not None
+        write_run_json(folder, "train", {"argv": names.command(job.arguments)}, started, record, names)
     return errors
+
+
+def _exported(
+    model: LightDepth,
+    data: FrameDataModule,
+    folder: Path,
+    chosen: Path,
+    errors: dict[str, float],
+    job: _Job,
+    echo: Echo,
+) -> dict[str, object]:
+    """Writes the model of the chosen checkpoint with its card, and returns what run.json is to say."""
+    exported = load_model(chosen)  # not `model`: where weights are averaged, the file has the average
+    assert isinstance(exported, NetworkModel)
+    doubt = _calibrate(exported.network, data, folder) if model.loss_config.uncertainty > 0 else None
+    # Not the trainer's step: of processes started for the fit alone, it never hears.
+    steps = int(torch.load(chosen.with_name(LAST), map_location="cpu", weights_only=True)["global_step"])
+    card = TrainedCard(
+        trained_on=_trained_on(model, data),
+        rows=model.rows,
+        steps=steps,
+        seed=job.seed,
+        checkpoint=chosen.stem,
+        network=model.network.config,
+        loss=model.loss_config,
+        fit=job.settings,
+        uncertainty=doubt,
+        tube=data.tube if data.tube.scenes or data.tube.val_scenes else None,
+        errors=errors,
+        version=versions().get("lightdepth", "not installed"),
+    )
+    save_model(exported.network, folder / "model.safetensors", card.record())
+    output = output_of(folder) or folder
+    write_whole(folder / "model.md", card.text(output.name))
+    echo(f"exported the {chosen.stem} checkpoint to {output / 'model.safetensors'}")
+    return {
+        "seed": job.seed,
+        "inputs": {echo.names.of(path): input_hash(Path(path)) for path in [*data.sequences, *data.val_sequences]},
+        "split": data.split and echo.names.of(data.split),
+        "frames": data.counts,
+        "steps": steps,
+        "units": {"rmse_mm": "mm", "medae_mm": "mm", "distance": "up to scale"},
+        "errors": errors,
+        "warnings": data.doubts,
+        "colour": {echo.names.of(path): colours.record() for path, colours in data.colours.items()},
+    }
+
+
+def _left(output: Path, flagged: bool) -> str:
+    """What is left of a run that was stopped outside its steps, and how to go on."""
+    if has_checkpoint(unfinished_path(output.resolve())) or (has_checkpoint(output) and read_record(output) is None):
+        return "its checkpoints are kept: --resume goes on"
+    return f"no step was made yet; {output.name} is as it was" if flagged else "no step was made yet"
+
+
+def _warn_of_length(echo: Callable[[str], None], model: LightDepth, start: Start, steps: int) -> None:
+    """A learning rate that depends on the length of the run was another one until now."""
+    planned, schedule = start.planned, model.schedule
+    if schedule == "constant" or steps <= 0 or math.isnan(planned) or planned == steps or not start.step:
+        return
+    echo(
+        f"warning: the first {start.step} steps were of a run of {planned:.0f}, and the learning rate of "
+        f"--model.schedule {schedule} follows from its length: the result is not that of {steps} steps at once"
+    )
 
 
 @contextmanager
@@ -270,79 +278,6 @@ def _set_calibration(network: DepthNetwork, fitted: Calibration) -> None:
     network.uncertainty.calibration.copy_(new)
 
 
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-class _SaveLast(pl.Callback):
-    """The last checkpoint of a run that ends well, before averaging puts the average in the place of the weights."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        trainer.save_checkpoint(self.path)
-
-
-def _with_callbacks(
-    given: Mapping[str, object], output: Path, echo: Callable[[str], None], data: FrameDataModule, settings: FitConfig
-) -> dict[str, object]:
-    """Trainer options completed by the run's logger, checkpoints and progress."""
-    options = dict(given)
-    interval, asked = options.get("val_check_interval"), options.get("max_steps")
-    steps = asked if isinstance(asked, int) and asked else -1
-    if isinstance(interval, int) and 0 < steps < interval:
-        options["val_check_interval"] = interval = steps  # a short run is validated once, at its end
-    options["logger"] = _logger(options.get("logger"), output)
-    folder = str(output / "checkpoints")
-    monitor = f"val/{settings.monitor}"
-    best = (
-        []
-        if settings.monitor == "last"
-        else [ModelCheckpoint(folder, "best", monitor=monitor, enable_version_counter=False)]
-    )
-    extra: list[pl.Callback] = [
-        *best,
-        ModelCheckpoint(
-            folder,
-            "last",
-            every_n_train_steps=interval if isinstance(interval, int) else 250,
-            save_on_exception=True,
-            enable_version_counter=False,
-        ),
-        Panels(),
-        Diagnosis(settings.diagnosis, data.names),
-        TrainingProgress(echo, every=report_every(steps)),
-        _SaveLast(output / "checkpoints" / "last.ckpt"),
-    ]
-    if settings.ema > 0:
-        extra.append(EMAWeightAveraging(decay=settings.ema))
-    if settings.patience > 0:
-        extra.append(EarlyStopping(monitor, patience=settings.patience))
-    if options["logger"] is not False:
-        extra.append(LearningRateMonitor("step"))
-    if options.get("enable_progress_bar") is None:
-        options["enable_progress_bar"] = sys.stderr.isatty()
-    if options["enable_progress_bar"]:
-        extra.append(RichProgressBar())
-    callbacks = options.get("callbacks") or []
-    options["callbacks"] = [*(callbacks if isinstance(callbacks, list) else [callbacks]), *extra]
-    options.setdefault("default_root_dir", str(output))
-    return options
-
-
-def _logger(asked: object, output: Path) -> object:
-    """What logs a run, by our names; a logger of Lightning's, given from code, as it is."""
-    if asked in (None, True, "tensorboard"):
-        return TensorBoardLogger(str(output), name="tensorboard", version="")
-    if asked == "csv":
-        return CSVLogger(str(output), name="csv", version="")
-    return False if asked == "none" else asked
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrainedCard(Card):
     """The card of a checkpoint that was trained from the start."""
@@ -382,24 +317,3 @@ def _of_split(split: str | None) -> str:
     return (
         f" of the split {path.parent.parent.name}/{path.stem}" if path.parent.name == "splits" else f" of {path.name}"
     )
-
-
-def _first_process() -> bool:
-    """Known before there is a Trainer: the launcher's environment says it."""
-    return getattr(rank_zero_only, "rank", 0) == 0
-
-
-class _Echo:
-    """Lines for the terminal and the run's log, from the first process only.
-
-    A class, not a closure, because it is pickled to worker processes."""
-
-    def __init__(self, log: Path, names: Names) -> None:
-        self.log, self.names = log, names
-
-    def __call__(self, line: str) -> None:
-        if not _first_process():
-            return
-        print(line, file=sys.stderr, flush=True)
-        with self.log.open("a", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(self.names.text(line) + "\n")

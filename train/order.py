@@ -13,6 +13,11 @@ class Shuffled(Sampler[int]):
 
     def __init__(self, count: int, seed: int) -> None:
         self.count, self.seed, self.epoch = count, seed, 0
+        self._begun: tuple[int, int] | None = None
+
+    def go_on(self, epoch: int, rows: int) -> None:
+        """A run that is resumed begins with this epoch, and behind its first `rows` rows."""
+        self.epoch, self._begun = epoch, (epoch, rows)
 
     def set_epoch(self, epoch: int) -> None:
         self.epoch = epoch
@@ -21,7 +26,13 @@ class Shuffled(Sampler[int]):
         return self.count
 
     def __iter__(self) -> Iterator[int]:
-        return iter(np.random.default_rng((self.seed, self.epoch)).permutation(self.count).tolist())
+        past = self._begun[1] if self._begun is not None and self._begun[0] == self.epoch else 0
+        return iter(self.rows()[past:])
+
+    def rows(self) -> list[int]:
+        """The rows of the whole epoch, in their order."""
+        result: list[int] = np.random.default_rng((self.seed, self.epoch)).permutation(self.count).tolist()
+        return result
 
 
 class Halves(Shuffled):
@@ -33,8 +44,9 @@ class Halves(Shuffled):
         self.batches = max(1, frames // self.first)
         super().__init__(self.batches * batch_size, seed)
 
-    def __iter__(self) -> Iterator[int]:
+    def rows(self) -> list[int]:
         rng = np.random.default_rng((self.seed, self.epoch))
         frames = np.resize(rng.permutation(self.frames), (self.batches, self.first))
         colons = self.frames + np.resize(rng.permutation(self.colons), (self.batches, self.second))
-        return iter(np.concatenate([frames, colons], 1).ravel().tolist())
+        result: list[int] = np.concatenate([frames, colons], 1).ravel().tolist()
+        return result

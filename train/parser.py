@@ -31,7 +31,7 @@ def training_parser() -> Parser:
     from lightdepth.module import LightDepth
 
     from .datamodule import FrameData
-    from .fit import FitConfig
+    from .watching import FitConfig
 
     summary = "Train a depth network on frames alone, from the decline of the light."
     parser = Parser(prog="lightdepth train", description=summary, allow_abbrev=False)

@@ -41,6 +41,12 @@ class Received:
         if self.signal:
             _raise(self.signal, kept)
 
+    def listen(self) -> None:
+        """Sees to it that signals come here, where a library has put handlers of its own in the place of ours."""
+        if _layer is not None and _layer.holding is self:
+            for number in _layer.ours:
+                signal.signal(number, _layer)
+
 
 class _Layer:
     """The handler of all signals, of one process."""
@@ -48,6 +54,7 @@ class _Layer:
     def __init__(self) -> None:
         self.process = os.getpid()
         self.holding: Received | None = None
+        self.ours: list[signal.Signals] = []
         self.raised: weakref.ref[Interrupted] | None = None
         self._interrupts, self._last_interrupt = 0, -_TOGETHER_S
 
@@ -83,14 +90,14 @@ def ending_on_signals() -> Iterator[None]:
         return
     outer, before = _layer, {number: signal.getsignal(number) for number in SIGNALS}
     _layer = layer = _Layer()
-    ours = [number for number, handler in before.items() if handler not in (signal.SIG_IGN, None)]
+    layer.ours = [number for number, handler in before.items() if handler not in (signal.SIG_IGN, None)]
     try:
-        for number in ours:
+        for number in layer.ours:
             signal.signal(number, layer)
         yield
     finally:
         _layer = outer
-        for number in ours:
+        for number in layer.ours:
             signal.signal(number, before[number])
 
 

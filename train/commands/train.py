@@ -16,9 +16,11 @@ from lightdepth.command_line.parsing import parsed
 from lightdepth.command_line.presets import with_preset
 from lightdepth.reporting.names import KEPT
 from lightdepth.reporting.own_settings import with_real_settings
+from lightdepth.reporting.same import paths_in
 
 from ..datamodule import FrameDataModule
-from ..fit import check_output, fit
+from ..fit import fit
+from ..folder import check_output
 from ..parser import as_yaml, training_parser
 
 
@@ -37,11 +39,13 @@ def train(argv: list[str] | None = None) -> int:
     KEPT.set(config.keep_names)
 
     output = Path(config.output)
-    check_output(output, config.resume, config.overwrite)  # before the seconds that the rest takes
+    inputs = paths_in(config.as_dict())
+    check_output(output, config.resume, config.overwrite, inputs)  # before the seconds that the rest takes
     pl.seed_everything(config.seed, workers=True, verbose=False)
     made = parser.instantiate(config)
     text = as_yaml(parser, config)
     flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given, "settings": made.fit}
+    flags["inputs"] = inputs
     fit(made.model, FrameDataModule(made.data), output, asdict(made.trainer), text, config.seed, **flags)
     return 0
 
