@@ -12,6 +12,7 @@ import yaml
 from jsonargparse import get_loader, set_loader, set_parsing_settings
 
 from lightdepth import plain_yaml
+from lightdepth.regular import regular
 
 _WORDS = {True: "on", False: "off"}
 _DASHED = re.compile(r"[a-z][a-z0-9_.]*(-[a-z0-9_.]+)+")
@@ -19,8 +20,9 @@ _library = get_loader("yaml")
 
 
 def read_settings(file: Path) -> Any:
-    """What a file of settings holds. Raises OSError, UnicodeDecodeError or yaml.YAMLError."""
-    return with_words(plain_yaml.read(file))
+    """What a file of settings holds. Raises OSError, UnicodeDecodeError or yaml.YAMLError, and InputError of what is no
+    file, which would be waited for."""
+    return with_words(plain_yaml.read(regular(file, "expected a YAML file of settings")))
 
 
 def use_words() -> None:
