@@ -253,10 +253,11 @@ class FrameDataModule(pl.LightningDataModule):
     def train_dataloader(self) -> DataLoader[FrameBatch]:
         assert self._train is not None
         sampler = self._order()
-        epoch, batch = self._begun
-        # Of several processes each takes its share of all rows: there an epoch that was broken off begins anew.
-        alone = self.trainer is None or self.trainer.world_size == 1
-        sampler.go_on(epoch, batch * self.batch_size if alone else 0)
+        if self._begun != (0, 0):
+            epoch, batch = self._begun
+            # Of several processes each takes its share of all rows: there an epoch that was broken off begins anew.
+            alone = self.trainer is None or self.trainer.world_size == 1
+            sampler.go_on(epoch, batch * self.batch_size if alone else 0)
         full = len(self._train) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
         return self._loader(self._train, sampler, drop_last=full)
 
