@@ -143,8 +143,9 @@ def _failed(verb: str, error: Exception) -> int:
 def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     """The arguments of a verb's function by name, from the command line's words."""
     from lightdepth.command_line.gone_settings import without_gone
+    from lightdepth.command_line.mistakes import config_files, fail
     from lightdepth.command_line.options import with_groups
-    from lightdepth.command_line.parsing import config_files, fail, parsed
+    from lightdepth.command_line.parsing import parsed
     from lightdepth.command_line.presets import with_preset
     from lightdepth.files.replacing import check_apart
 

@@ -119,7 +119,7 @@ PARSED_IN = {
     "np.loadtxt": {"lightdepth.files.tum", "lightdepth.datasets.c3vd", "lightdepth.datasets.simcol"},
     "loadmat": set(),  # SciPy's crashes on spoilt files; calibration.mat_file reads them
     "trimesh.load": {"lightdepth.files.meshes"},
-    "zipfile.ZipFile": {"lightdepth.files.arrays"},
+    "zipfile.ZipFile": {"lightdepth.files.arrays", "lightdepth.files.weights"},
     "tarfile.open": {"lightdepth.datasets.scared_files", "lightdepth.datasets.scared_writing"},
     "msgpack.unpackb": {"lightdepth.maps.stella"},
     "cv2.imread": set(),

@@ -21,7 +21,8 @@ from raising import warned
 from lightdepth.cli import GROUP, main, verb_parser
 from lightdepth.command_line.gone_settings import without_gone
 from lightdepth.command_line.pages import PAGES
-from lightdepth.command_line.parsing import Parser, options, parsed
+from lightdepth.command_line.parsing import Parser, parsed
+from lightdepth.command_line.words import options
 from lightdepth.datasets import FORMATS, FormatName
 
 UNIT = re.compile(

@@ -11,7 +11,8 @@ from pathlib import Path
 import lightning.pytorch as pl
 
 from lightdepth.command_line.gone_settings import without_gone
-from lightdepth.command_line.parsing import fail, parsed
+from lightdepth.command_line.mistakes import fail
+from lightdepth.command_line.parsing import parsed
 from lightdepth.command_line.presets import with_preset
 from lightdepth.reporting.same import paths_in
 
