@@ -232,16 +232,17 @@ def test_a_job_that_slurm_warns_saves_itself_asks_for_another_start_and_goes_on_
     scontrol.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/asked\n')
     scontrol.chmod(0o755)
     given = options(sequence, "--trainer.max-steps", "100000", "--trainer.val-check-interval", "5")
+    given += ["--data.num-workers", "1"]
     given[given.index("--trainer.logger") + 1] = "tensorboard"
     command = [sys.executable, "-m", "lightdepth", "train", "-o", str(tmp_path / "run"), *given, "--resume"]
     slurm = {"SLURM_JOB_ID": "17", "SLURM_NTASKS": "1", "SLURM_JOB_NAME": "train", "OMP_NUM_THREADS": "1"}
     environment = {**os.environ, **slurm, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
     while not (tmp_path / "run" / "checkpoints" / "best.ckpt").exists():
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.02)
-    process.send_signal(signal.SIGUSR1)
-    process.send_signal(signal.SIGTERM)
+    for number in (signal.SIGUSR1, signal.SIGTERM):  # as Slurm does, to all processes of the job
+        os.killpg(process.pid, number)
     error = process.communicate(timeout=120)[1]
     assert process.returncode in (128 + signal.SIGUSR1, 128 + signal.SIGTERM), error
     said = error.strip().splitlines()[-1]
