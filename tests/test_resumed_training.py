@@ -39,6 +39,11 @@ class Signal(Callback):
             signal.raise_signal(signal.SIGTERM)
 
 
+class Early(Callback):
+    def on_train_start(self, trainer, module):
+        signal.raise_signal(signal.SIGTERM)
+
+
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory) -> Path:
     return write_sequence(tmp_path_factory.mktemp("data") / "seq", 9)
@@ -111,10 +116,10 @@ def same(one, other):
 
 def test_a_run_stopped_twice_within_epochs_is_the_uninterrupted_one_to_the_bit(sequence, tmp_path, one_thread):
     """Eight frames in batches of two: an epoch has four steps, and validations come in between."""
-    given = options(sequence, "--trainer.max-steps", "10", "--trainer.val-check-interval", "3")
+    given = options(sequence, "--trainer.max-steps", "7", "--trainer.val-check-interval", "3")
     given += ["--fit.ema", "0.5", "--fit.patience", "3"]
     whole = halted(tmp_path / "whole", given, [])
-    assert difference(halted(tmp_path / "halted", given, [1, 5]), whole) == []
+    assert difference(halted(tmp_path / "halted", given, [2, 4]), whole) == []
 
 
 @pytest.mark.slow
@@ -145,11 +150,11 @@ def test_a_finished_run_that_is_made_longer_is_the_longer_one_where_the_schedule
     given = options(sequence, "--model.schedule", "constant", "--trainer.val-check-interval", "4")
     folder = halted(tmp_path / "longer", [*given, "--trainer.max-steps", "3"], [])
     capfd.readouterr()
-    assert run(folder, [*given, "--trainer.max-steps", "8"], resume=True) == 0
+    assert run(folder, [*given, "--trainer.max-steps", "6"], resume=True) == 0
     assert "warning" not in capfd.readouterr().err
-    assert difference(folder, halted(tmp_path / "once", [*given, "--trainer.max-steps", "8"], [])) == []
+    assert difference(folder, halted(tmp_path / "once", [*given, "--trainer.max-steps", "6"], [])) == []
     capfd.readouterr()
-    assert run(folder, [*given, "--trainer.max-steps", "9", "--model.schedule", "cosine"], resume=True) == 0
+    assert run(folder, [*given, "--trainer.max-steps", "7", "--model.schedule", "cosine"], resume=True) == 0
     assert "steps at once" in capfd.readouterr().err
 
 
@@ -181,12 +186,12 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_that_was_there(tmp_p
 
 
 def test_overwriting_leaves_the_old_result_whole_until_the_new_one_is(sequence, tmp_path):
-    given = options(sequence, "--trainer.max-steps", "4", "--trainer.val-check-interval", "2")
+    given = options(sequence, "--trainer.max-steps", "2", "--trainer.val-check-interval", "1")
     folder = halted(tmp_path / "run", given, [])
     old = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    for step in (0, 3):  # before the first checkpoint, and behind it
+    for step in (None, 1):  # before the first checkpoint, and behind it
         with pytest.raises(Interrupted):
-            run(folder, [*given, "--seed", "1", "--overwrite"], [Signal([step])])
+            run(folder, [*given, "--seed", "1", "--overwrite"], [Signal([step]) if step else Early()])
         assert {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()} == old
     assert (tmp_path / ".run.unfinished" / "checkpoints" / "last.ckpt").exists()
     with refused(found="unfinished"):
@@ -227,16 +232,17 @@ def test_a_job_that_slurm_warns_saves_itself_asks_for_another_start_and_goes_on_
     scontrol.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/asked\n')
     scontrol.chmod(0o755)
     given = options(sequence, "--trainer.max-steps", "100000", "--trainer.val-check-interval", "5")
+    given += ["--data.num-workers", "1"]
     given[given.index("--trainer.logger") + 1] = "tensorboard"
     command = [sys.executable, "-m", "lightdepth", "train", "-o", str(tmp_path / "run"), *given, "--resume"]
     slurm = {"SLURM_JOB_ID": "17", "SLURM_NTASKS": "1", "SLURM_JOB_NAME": "train", "OMP_NUM_THREADS": "1"}
     environment = {**os.environ, **slurm, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
     while not (tmp_path / "run" / "checkpoints" / "best.ckpt").exists():
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.02)
-    process.send_signal(signal.SIGUSR1)
-    process.send_signal(signal.SIGTERM)
+    for number in (signal.SIGUSR1, signal.SIGTERM):  # as Slurm does, to all processes of the job
+        os.killpg(process.pid, number)
     error = process.communicate(timeout=120)[1]
     assert process.returncode in (128 + signal.SIGUSR1, 128 + signal.SIGTERM), error
     said = error.strip().splitlines()[-1]

@@ -197,7 +197,8 @@ class Checkpoints(pl.Callback):
         diagnosed = isinstance(exception, PartialFailure | InputError)
         total = _done(trainer)
         whole = total.started == total.processed and (total.processed == total.completed or diagnosed)
-        if trainer.training and whole and not _gradient_waits(trainer) and trainer.global_step not in (0, self._saved):
+        new = trainer.global_step not in (0, self._saved)
+        if new and trainer.training and whole and not _gradient_waits(trainer):
             self._save(trainer, LAST)
 
     def _save(self, trainer: pl.Trainer, name: str) -> None:

@@ -6,6 +6,7 @@ resumed run sees what an uninterrupted one would have seen.
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,7 @@ from train.order import Halves, Shuffled
 
 _NO_TUBE = TubeData()
 _WHITE = LossConfig().white
+_GRACE_S = 120.0
 _LOOKED_AT = 256  # frames whose colours are looked at, of all sequences together
 
 
@@ -253,10 +255,11 @@ class FrameDataModule(pl.LightningDataModule):
     def train_dataloader(self) -> DataLoader[FrameBatch]:
         assert self._train is not None
         sampler = self._order()
-        epoch, batch = self._begun
-        # Of several processes each takes its share of all rows: there an epoch that was broken off begins anew.
-        alone = self.trainer is None or self.trainer.world_size == 1
-        sampler.go_on(epoch, batch * self.batch_size if alone else 0)
+        if self._begun != (0, 0):
+            epoch, batch = self._begun
+            # Of several processes each takes its share of all rows: there an epoch that was broken off begins anew.
+            alone = self.trainer is None or self.trainer.world_size == 1
+            sampler.go_on(epoch, batch * self.batch_size if alone else 0)
         full = len(self._train) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
         return self._loader(self._train, sampler, drop_last=full)
 
@@ -292,7 +295,14 @@ class FrameDataModule(pl.LightningDataModule):
             num_workers=self.config.num_workers,
             persistent_workers=self.config.num_workers > 0,
             collate_fn=collate,
+            worker_init_fn=_outliving_a_signal,
         )
+
+
+def _outliving_a_signal(worker: int) -> None:
+    """A scheduler's SIGTERM is for all processes of a job; the run still needs frames to finish its step, and ends this
+    process then. Should it not, an alarm does."""
+    signal.signal(signal.SIGTERM, lambda number, frame: signal.setitimer(signal.ITIMER_REAL, _GRACE_S))
 
 
 def held_out_count(frames: int, share: float) -> int:
