@@ -147,7 +147,7 @@ def test_import_goes_on_with_the_measures_and_pictures_that_it_has(few_frames, t
     assert len([p for p in parts if p.startswith("pictures")]) >= 3
 
 
-@pytest.mark.parametrize(("every", "judging"), [(2, False), pytest.param(1, True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("every", "judging"), [(3, False), pytest.param(1, True, marks=pytest.mark.slow)])
 def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(
     tmp_path, stopping, each_alone, monkeypatch, every, judging
 ):
