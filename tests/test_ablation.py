@@ -336,5 +336,5 @@ def test_a_wrong_and_a_random_reflectance_reach_what_is_trained_on(cheap):
     drawn = seen(True, random_reflectance=(0.3, 0.5))
     assert len(set(drawn)) == len(drawn) and all(0.3 <= v <= 0.5 for v in drawn)
     assert seen(False, random_reflectance=(0.3, 0.5)) == seen(False)
-    with refused(found="random_reflectance"):
+    with refused(where="random_reflectance"):
         FrameDataModule(FrameData(random_reflectance=(0.5, 0.2)))
