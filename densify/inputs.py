@@ -23,7 +23,7 @@ from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
 from lightdepth.maps.convention import MapReading
 from lightdepth.models import ConstantModel, DepthModel
-from lightdepth.ranges import above
+from lightdepth.ranges import above, checked
 from lightdepth.reporting.kept import kept
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
@@ -35,6 +35,7 @@ from lightdepth.uncalibrated import check_camera_asked, open_frames
 
 
 @dataclass(frozen=True)
+@checked
 class SurfaceFiles:
     """How surfaces are written."""
 
@@ -47,7 +48,6 @@ class SurfaceFiles:
     def __post_init__(self) -> None:
         if "ply" not in self.formats:
             raise InputError("--formats", f"{list(self.formats)}", "expected ply, and besides it glb and obj if wanted")
-        check_unit(self.mm_per_unit)
 
 
 @dataclass(frozen=True)

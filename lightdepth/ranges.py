@@ -8,6 +8,7 @@ settings that are made in a program. A range holds for each number of a list; Na
 
 from __future__ import annotations
 
+import reprlib
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
@@ -85,15 +86,16 @@ PIXELS = at_least(1, up_to=100_000)
 """Of a width or a height."""
 
 
-def numbers(value: object) -> Iterator[float]:
-    """All numbers of a value; of anything but numbers and lists of them, none."""
+def numbers(value: object, depth: int = 3) -> Iterator[float]:
+    """All numbers of a value, in lists up to `depth` deep; of anything else, none. A stranger's lists, which hold one
+    another again and again, are not gone through: they are no settings, and are refused for what they are."""
     if isinstance(value, bool):
         return
     if isinstance(value, int | float):
         yield value
     elif isinstance(value, list | tuple):
-        for one in value:
-            yield from numbers(one)
+        for one in value if depth else ():
+            yield from numbers(one, depth - 1)
 
 
 def range_of(kind: Any) -> Range | None:
@@ -123,7 +125,7 @@ def checked(settings: type[_Settings]) -> type[_Settings]:
         for name, one in known[made].items():
             value = getattr(self, name)
             if wrong := one.wrong(value):
-                raise InputError(f"{made.__name__}.{name}", f"{value}", wrong)
+                raise InputError(f"{made.__name__}.{name}", reprlib.repr(value), wrong)
         if own is not None:
             own(self, *initial)
 
