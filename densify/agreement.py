@@ -58,7 +58,7 @@ class AgreementConfig:
     samples: Annotated[int, at_least(1, up_to=10_000)] = 16
     """Number of pixels across the image at which keyframes are compared, and as many down as keeps the spacing equal;
     live compares none. More find finer disagreement and take longer."""
-    rounds: Annotated[int, at_least(1, up_to=10_000)] = 8
+    rounds: Annotated[int, at_least(0, up_to=10_000)] = 8
     """Largest number of rounds (Gauss-Newton steps) in which keyframes are fitted together; tolerance may end them
     sooner. More come closer to the solution and take longer."""
     tolerance: Annotated[float, at_least(0)] = 1e-3

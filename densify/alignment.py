@@ -50,7 +50,7 @@ class AlignmentConfig:
     min_points: Annotated[int, COUNT] = 8
     """Least number of map points, observed where the model predicts a distance, that a keyframe needs; one with fewer
     is left out of the surface. More make scales safer and leave out more keyframes."""
-    min_inliers: Annotated[int, COUNT] = 6
+    min_inliers: Annotated[int, at_least(0, up_to=1_000_000)] = 6
     """Least number of inliers (points within t sigmas) that a keyframe needs; one with fewer is left out of the
     surface. More make scales safer and leave out more keyframes."""
     min_inlier_share: Annotated[float, SHARE] = 0.5

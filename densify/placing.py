@@ -17,6 +17,7 @@ from densify.predictions import SeenKeyframe
 from lightdepth.light.views import Placed
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
+from lightdepth.ranges import LARGEST
 from lightdepth.sparse_map import Submap
 
 
@@ -45,10 +46,10 @@ def _open(config: AlignmentConfig) -> AlignmentConfig:
         config,
         min_inliers=0,
         min_inlier_share=0.0,
-        max_relative_sigma=np.inf,
+        max_relative_sigma=LARGEST,
         min_spread_deg=0.0,
         min_distance_spread=0.0,
-        max_second_mode=np.inf,
+        max_second_mode=LARGEST,
     )
 
 

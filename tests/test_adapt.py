@@ -82,7 +82,8 @@ def test_without_a_judge_the_network_is_held_near_its_start_and_called_not_judge
     assert record["after"]["loss"] < record["before"]["loss"]
     assert record["frames"] == {"train": 8, "val": 2} and record["before"]["truth"] is None
     assert {p.name for p in (tmp_path / "run").iterdir()} == {
-        *("config.yaml", "log.txt", "light.json", "model.safetensors", "model.md", "report.html", "run.json")
+        *("config.yaml", "log.txt", "light.json", "model.safetensors", "model.md", "report.html", "run.json"),
+        "inputs.json",
     }
     card = read_card(tmp_path / "run" / "model.safetensors")
     assert card["adapted_from"] == "start" and card["rows"] == SIZE[1]

@@ -65,7 +65,13 @@ class _LibraryError(Exception):
 @pytest.mark.parametrize(
     "error",
     [ValueError("a"), KeyError("a"), IndexError(), OverflowError("a"), struct.error("a"), zlib.error("a"), EOFError()]
-    + [NotImplementedError("a"), RuntimeError("encrypted"), _LibraryError("a\nb" * 200), OSError(5, "disk"), OSError()]
+    + [
+        NotImplementedError("a"),
+        RuntimeError("encrypted"),
+        _LibraryError("a\nb" * 200),
+        OSError(13, "no right"),
+        OSError(),
+    ]
     + [MemoryError(), RecursionError(), tarfile.ReadError("a"), zipfile.BadZipFile("a"), cv2.error("a")]
     + [Image.DecompressionBombError("a"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "a")],
     ids=repr,
@@ -80,6 +86,8 @@ def test_whatever_a_library_raises_is_told_of_the_file_in_one_short_line(error):
 def test_what_says_more_already_and_our_own_mistakes_pass_through():
     with refused(where="line 3", found="x"), reading("file.bin"):
         raise InputError("line 3", "x", "y")
+    with pytest.raises(OSError), reading("file.bin"):
+        raise OSError(5, "the disk, not the file")
     lightdepth_s = {"__name__": "lightdepth.made_up"}
     with pytest.raises(AssertionError), reading("file.bin"):
         exec(compile("def f():\n    assert False, 'ours'\nf()", "made_up", "exec"), lightdepth_s)

@@ -104,12 +104,12 @@ def test_scenes_of_a_seed_are_the_same_and_their_names_are_not_those_of_other_si
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"wrong_shares": (0.1, 1.0)}, "expected shares of at least 0 and below 1"),
+        ({"wrong_shares": (0.1, 1.0)}, "each number of at least 0 and below 1"),
         ({"wrong_shares": (0.1, 0.1)}, "none twice"),
         ({"recipes": ()}, "at least one"),
         ({"cases": ("side", "side")}, "none twice"),
-        ({"image_size": (8, 8)}, "at least 32 pixels"),
-        ({"first_seed": -1}, "expected 0 or more"),
+        ({"image_size": (8, 8)}, "each number from 32"),
+        ({"first_seed": -1}, "a number of at least 0"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_before_anything_is_rendered(changes, message):

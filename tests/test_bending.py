@@ -84,7 +84,7 @@ def test_the_prior_holds_bumps_and_slope_by_their_deviations_and_the_scale_not_a
     found = BendingConfig(grids=(2, 3), slope_deviation=0.5, bump_deviation=0.1).precision
     np.testing.assert_allclose(found, [0, 4, *[100] * 13])
     assert BendingConfig(grids=(2,), slope_deviation=0.0).precision.tolist() == pytest.approx([0, *[100] * 4])
-    with refused("slope_deviation -0.1"):
+    with refused(where="BendingConfig.slope_deviation"):
         BendingConfig(slope_deviation=-0.1)
 
 

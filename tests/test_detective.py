@@ -201,7 +201,7 @@ def test_a_wrong_pairing_is_an_error_and_a_trusted_one_a_warning(tmp_path):
     late = shown(film(), 1)
     with refused(found="1 frame later", cure="--trust-map"):
         check_pairing(honest_map(), late)
-    run = Run(tmp_path, "densify", {})
+    run = Run(tmp_path, tmp_path, "densify", {})
     with pytest.warns(UserWarning, match="1 frame later"):
         check_pairing(honest_map(), late, PairingConfig(trust_map=True), run)
     said = run.record["pairing"]
@@ -238,7 +238,7 @@ def test_a_map_whose_keypoints_contradict_its_reading_is_refused_and_the_right_o
 
 
 def test_frames_and_a_map_on_disk_meet_only_where_the_images_agree(tmp_path):
-    run, recipe = Run(tmp_path, "densify", {}), SfmConfig()
+    run, recipe = Run(tmp_path, tmp_path, "densify", {}), SfmConfig()
     write_folder(shown(film()), tmp_path / "right")
     write_folder(shown(film(), 2), tmp_path / "late")
     write_text_model(honest_map().submaps[0], tmp_path / "map")

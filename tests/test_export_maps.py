@@ -269,16 +269,16 @@ def test_without_its_map_and_frames_a_run_is_still_exported_and_what_is_missing_
 
 
 def test_what_cannot_be_exported_is_refused_with_what_could(place, tmp_path, capsys):
-    def refusal(*words: str) -> str:
-        assert main(["export", *words, "-o", str(tmp_path / "out")]) == 3
+    def refusal(*words: str, code: int = 3) -> str:
+        assert main(["export", *words, "-o", str(tmp_path / "out")]) == code
         return capsys.readouterr().err
 
-    assert "expected one of colmap" in refusal(str(place / "run"))
+    assert "expected one of colmap" in refusal(str(place / "run"), code=2)
     assert "lightdepth densify" in refusal(str(place / "data"), "--to", "glb")
     assert "lightdepth predict" in refusal(str(place / "run"), "--to", "exr")
     assert "no network" in refusal("decline", "--to", "onnx")
     assert "leave it out" in refusal("lightdepth-self", "--to", "safetensors", "--size", "[64, 64]")
-    assert "number of points" in refusal(str(place / "run"), "--to", "colmap", "--points", "-1")
+    assert "--points: -1" in refusal(str(place / "run"), "--to", "colmap", "--points", "-1")
     assert not (tmp_path / "out").exists()
     (tmp_path / "x.bin").write_bytes(b"1&2")
     with pytest.raises(ValueError, match="not a map of COLMAP's"):

@@ -385,7 +385,7 @@ def test_the_log_error_has_no_scale_and_is_zero_where_there_is_no_truth():
     [{"space": "hsv"}, {"gain": "two"}, {"smoothness": -1.0}, {"huber": -0.1}, {"ambient": -0.1}, {"shoulder": 1.2}],
 )
 def test_a_loss_that_makes_no_sense_is_refused(values):
-    with refused(where="oss"):
+    with refused(where="LossConfig"):
         LossConfig(**values)
 
 
@@ -484,14 +484,14 @@ def test_a_term_is_taken_where_it_has_a_weight_and_the_total_is_their_weighted_s
 @pytest.mark.parametrize("name", [*TERMS, "self_supervised", "supervised", "uncertainty", "huber", "ambient"])
 def test_no_weight_is_below_zero_and_zero_is_one(name):
     assert getattr(LossConfig(**{name: 0.0}), name) == 0
-    with refused(where="loss"):
+    with refused(where="LossConfig"):
         LossConfig(**{name: -1e-3})
 
 
 @pytest.mark.parametrize("shoulder", [0.19, 1.01])
 def test_a_shoulder_lies_between_a_fifth_and_white(shoulder):
     assert [LossConfig(shoulder=s).shoulder for s in (0.2, 1.0)] == [0.2, 1.0]
-    with refused(where="loss"):
+    with refused(where="LossConfig"):
         LossConfig(shoulder=shoulder)
 
 
