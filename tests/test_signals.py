@@ -14,6 +14,14 @@ from lightdepth.errors import Interrupted
 from lightdepth.reporting.run import run_folder
 
 
+@pytest.fixture(autouse=True)
+def heard():
+    """Interrupts are heard, also where the tests themselves run in a shell's background, which ignores them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture
 def verb(monkeypatch):
     """Makes a function the one verb of the program."""

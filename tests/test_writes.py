@@ -47,8 +47,9 @@ ALLOWED = {
     "densify/densified.py: write": _RUN,
     "densify/exporting/work.py: export_maps": _RUN,
     "train/commands/ablate.py: _ablate": "write_table and write_inputs use write_whole",
-    "train/fit.py: fit": "write_inputs uses write_whole",
-    "train/fit.py: __call__": "log.txt of a training, which grows while it lasts",
+    "train/checkpoints.py: _keep": "renames a checkpoint that write_whole wrote: the one before is kept",
+    "train/fit.py: _fitted": "write_inputs uses write_whole",
+    "train/watching.py: __call__": "log.txt of a training, which grows while it lasts",
     "train/commands/adapt.py: _fit": _RUN,
 }
 """Where a path is not seen to be below a run folder, and why it is whole nevertheless."""
