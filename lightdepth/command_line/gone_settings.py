@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lightdepth.command_line.config_words import with_configs
+
 _WITHHOLD = "the surface uses every point; blocks of wall judge it, see judge.folds"
 _NO_EFFECT = "it had no effect"
 _NO_CODE = "settings name no code: fit() of train.fit takes such objects"
@@ -36,12 +38,7 @@ def without_gone(verb: str, argv: Sequence[str]) -> list[str]:
     """The words of a command line; a --config FILE with settings that are not taken from it is put in as text without
     them."""
     gone = GONE_SETTINGS.get(verb, {})
-    words = list(argv)
-    for place, word in enumerate(words):
-        joined = word.startswith("--config=")
-        if joined or (place > 0 and words[place - 1] == "--config"):
-            words[place] = ("--config=" if joined else "") + _kept(word.removeprefix("--config="), gone)
-    return words
+    return with_configs(argv, lambda file: _kept(file, gone))
 
 
 def without_given(settings: dict[str, Any]) -> list[str]:

@@ -7,13 +7,13 @@ import difflib
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn, get_origin
 
 import yaml
 from jsonargparse import ArgumentParser
 
+from lightdepth.command_line.config_words import configs
 from lightdepth.command_line.gone_settings import GONE_SETTINGS
 from lightdepth.command_line.kinds import choices_of_type, expected, list_apart, literals
 from lightdepth.command_line.pages import Page
@@ -120,8 +120,7 @@ def _on_line(argv: Sequence[str], key: str) -> bool:
 
 def config_files(argv: Sequence[str]) -> Iterator[Path]:
     """The files that --config names among the words of a command line."""
-    for word, following in pairwise([*argv, ""]):
-        path = following if word == "--config" else word.removeprefix("--config=") if word[:9] == "--config=" else ""
+    for path in configs(argv):
         if path and "\n" not in path and Path(path).is_file():  # settings may stand there themselves (gone_settings)
             yield Path(path)
         elif path and "\n" not in path:

@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from lightdepth.command_line.config_words import configs
 from lightdepth.files.named_inputs import INPUTS, real_inputs
 from lightdepth.files.replacing import BEGUN, PARTS
 from lightdepth.files.writing import PARTIAL
@@ -212,8 +212,7 @@ def _inputs(value: Any, option: str = "input") -> Iterator[tuple[str, str]]:
 
 
 def _config_files(words: Iterable[str]) -> Iterator[tuple[str, str]]:
-    for word, following in pairwise([*words, ""]):
-        path = following if word == "--config" else word.removeprefix("--config=") if word[:9] == "--config=" else ""
+    for path in configs(list(words)):
         if path and "\n" not in path and _is_there(path):
             yield "config", path
 

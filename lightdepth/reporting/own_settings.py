@@ -7,6 +7,7 @@ from pathlib import Path
 
 import yaml
 
+from lightdepth.command_line.config_words import with_configs
 from lightdepth.command_line.settings_yaml import read_settings
 from lightdepth.errors import InputError
 from lightdepth.files.named_inputs import INPUTS, real, real_inputs, unknown_names
@@ -18,13 +19,7 @@ def with_real_settings(argv: Sequence[str]) -> list[str]:
     """The words of a command line; a --config FILE that calls inputs by names is put in as text with their paths, and
     without where that run went. Raises InputError where inputs.json beside it is gone, for names of options that the
     command line does not give."""
-    words = list(argv)
-    for place, word in enumerate(words):
-        joined = word.startswith("--config=")
-        if joined or (place > 0 and words[place - 1] == "--config"):
-            text = _text_of(word.removeprefix("--config="), argv)
-            words[place] = word if text is None else f"--config={text}" if joined else text
-    return words
+    return with_configs(argv, lambda file: _text_of(file, argv) or file)
 
 
 def _text_of(file: str, argv: Sequence[str]) -> str | None:
