@@ -284,10 +284,10 @@ def child(parser: Any, seconds: float, seed: int, folder: Path, guided: Any) -> 
     if status.is_file():
         pages = int(status.read_text().split()[0])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MOST_BYTES, resource.RLIM_INFINITY))
-    before, began, said = _resident(), time.monotonic(), 0.0
+    before, began, said = _resident(), time.process_time(), 0.0
 
     def note() -> None:
-        fuzzing.found.seconds = time.monotonic() - began
+        fuzzing.found.seconds = time.process_time() - began
         fuzzing.found.peak_mb = max(0.0, _resident() - before)
         (folder / "found.json").write_text(json.dumps(asdict(fuzzing.found)))
 
@@ -295,7 +295,7 @@ def child(parser: Any, seconds: float, seed: int, folder: Path, guided: Any) -> 
         nonlocal said
         if data:
             fuzzing.one(data[0] % len(fuzzing.samples), data[1:])
-        now = time.monotonic() - began
+        now = time.process_time() - began
         if now > said + 1 or now > seconds:
             said = now
             note()
@@ -331,7 +331,7 @@ def run(parser: Any, seconds: float, seed: int, guided: Any) -> Found:
     parser.samples()
     while left > 1:
         with tempfile.TemporaryDirectory(prefix="fuzz-") as place:
-            folder, began = Path(place), time.monotonic()
+            folder = Path(place)
             process = os.fork()
             if process == 0:
                 child(parser, left, seed, folder, guided)
@@ -347,7 +347,7 @@ def run(parser: Any, seconds: float, seed: int, guided: Any) -> Found:
             total.inputs, total.refused = total.inputs + found.inputs, total.refused + found.refused
             total.seconds, total.peak_mb = total.seconds + found.seconds, max(total.peak_mb, found.peak_mb)
             total.findings |= found.findings
-            left -= max(time.monotonic() - began, 5) if died else left
+            left -= max(found.seconds, 5) if died else left
             seed += 1
     return total
 
@@ -370,7 +370,7 @@ def _waited_for(process: int, folder: Path) -> str:
 def main() -> int:
     parse = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parse.add_argument("parsers", nargs="*", help="names of parsers; all of them where left out")
-    parse.add_argument("--seconds", type=float, default=60, help="for each parser")
+    parse.add_argument("--seconds", type=float, default=60, help="of processor time, for each parser")
     parse.add_argument("--seed", type=int, default=0)
     parse.add_argument("--blind", action="store_true", help="without atheris, though it is installed")
     asked = parse.parse_args()
@@ -388,10 +388,8 @@ def main() -> int:
     for name in asked.parsers or strangers.PARSERS:
         found = run(strangers.PARSERS[name], asked.seconds, asked.seed, guided)
         failed |= bool(found.findings)
-        share = f"{found.refused / max(found.inputs, 1):.0%} refused"
-        print(
-            f"{name}: {found.inputs} inputs in {found.seconds:.0f} s, {share}, {found.peak_mb:.0f} MB more", flush=True
-        )
+        share = f"{found.refused / max(found.inputs, 1):.0%} refused, {found.peak_mb:.0f} MB more"
+        print(f"{name}: {found.inputs} inputs in {found.seconds:.0f} s of processor time, {share}", flush=True)
         for file, wrong in found.findings.items():
             print(f"    {file}: {wrong}", flush=True)
     return int(failed)
