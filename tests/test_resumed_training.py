@@ -155,7 +155,9 @@ def test_a_finished_run_that_is_made_longer_is_the_longer_one_where_the_schedule
     assert difference(folder, halted(tmp_path / "once", [*given, "--trainer.max-steps", "6"], [])) == []
     capfd.readouterr()
     assert run(folder, [*given, "--trainer.max-steps", "7", "--model.schedule", "cosine"], resume=True) == 0
-    assert "steps at once" in capfd.readouterr().err
+    said = capfd.readouterr().err
+    assert "steps at once" in said
+    assert "--model.schedule was constant and is cosine" in said and "--trainer.max-steps was" not in said
 
 
 def test_the_newest_checkpoint_that_reads_is_resumed_and_named(sequence, tmp_path):

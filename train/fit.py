@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -41,6 +41,7 @@ from .checkpoints import BEST, LAST, Start, newest
 from .colons import TubeData
 from .datamodule import FrameDataModule
 from .folder import begin_in, first_process, has_checkpoint, training_folder
+from .going_on import settings_before, warn_of_length, warn_of_settings
 from .requeue import requeued
 from .running import quiet
 from .trainer_options import check_trainer_options
@@ -117,6 +118,7 @@ def _fitted(
     output = output_of(folder) or folder
     names = Names() if KEPT.get() else names_of(asked, (output, folder), argv=job.arguments)
     echo = Echo(folder / "log.txt", names)
+    before = settings_before(folder) if start is not None else None
     if first_process():
         begin_in(folder)
         settings = job.config_yaml
@@ -138,7 +140,8 @@ def _fitted(
             echo(start.said if start else "nothing to resume: starting anew")
         if start is not None:
             data.go_on(start.epoch, start.batch)
-            _warn_of_length(echo, model, start, trainer.max_steps)
+            warn_of_length(echo, model, start, trainer.max_steps)
+            warn_of_settings(echo, before, names.hidden(asked["settings"], exactly=True))
         with _refusals_named(MisconfigurationException):
             path = None if start is None else start.path
             trainer.fit(model, datamodule=data, ckpt_path=path, weights_only=True)
@@ -209,17 +212,6 @@ def _left(output: Path, flagged: bool) -> str:
     if has_checkpoint(unfinished_path(output.resolve())) or (has_checkpoint(output) and read_record(output) is None):
         return "its checkpoints are kept: --resume goes on"
     return f"no step was made yet; {output.name} is as it was" if flagged else "no step was made yet"
-
-
-def _warn_of_length(echo: Callable[[str], None], model: LightDepth, start: Start, steps: int) -> None:
-    """A learning rate that depends on the length of the run was another one until now."""
-    planned, schedule = start.planned, model.schedule
-    if schedule == "constant" or steps <= 0 or math.isnan(planned) or planned == steps or not start.step:
-        return
-    echo(
-        f"warning: the first {start.step} steps were of a run of {planned:.0f}, and the learning rate of "
-        f"--model.schedule {schedule} follows from its length: the result is not that of {steps} steps at once"
-    )
 
 
 @contextmanager
