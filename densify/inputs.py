@@ -182,12 +182,6 @@ class _ImagesOf:
         return self.frames.of_keyframe(self.keyframes[i])
 
 
-def check_unit(mm_per_unit: float | None) -> None:
-    """Raises InputError for millimetres per map unit that cannot be."""
-    if mm_per_unit is not None and not mm_per_unit > 0:
-        raise InputError("--mm-per-unit", f"{mm_per_unit}", "expected a positive number of millimetres")
-
-
 def fitted_light(
     run: Run, frames: FrameSequence, sparse_map: SparseMap, model: DepthModel, config: MethodConfig, wanted: bool
 ) -> FrameSequence:

@@ -139,7 +139,7 @@ def test_the_verb_refuses_a_fit_that_is_far_off_with_its_residual(tmp_path, caps
     said = " ".join(capsys.readouterr().err.split())
     assert "the nearest PINHOLE is off by" in said and "(largest); expected 0.48 at most" in said
     assert not (tmp_path / "out.json").exists()
-    assert main([*argv, "--most-px", "-1"]) == 3 and "expected a number of at least 0" in capsys.readouterr().err
+    assert main([*argv, "--most-px", "-1"]) == 3 and "expected a number above 0" in capsys.readouterr().err
     assert main([*argv, "--most-px", "100"]) == 0 and (tmp_path / "out.json").exists()
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from densify.config import LiveConfig
-from densify.inputs import MapSource, check_unit, doubts_of_inputs, fitted_light, map_and_frames
+from densify.inputs import MapSource, doubts_of_inputs, fitted_light, map_and_frames
 from densify.live.play import play
 from densify.live.record import PlayedRun
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -50,7 +50,6 @@ def live(
             use it if depth by it fits hidden blocks of wall better; switched off, a usual light is assumed.
         overwrite: Replace a run made before.
     """
-    check_unit(mm_per_unit)
     if not budget_ms > 0:
         raise InputError("--budget-ms", f"{budget_ms}", "expected milliseconds above 0")
     if rate is not None and not rate > 0:

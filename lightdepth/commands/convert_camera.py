@@ -10,7 +10,7 @@ from lightdepth.calibration import read_camera, write_camera
 from lightdepth.datasets.sequence import read_mask
 from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_files
-from lightdepth.ranges import PIXELS, at_least
+from lightdepth.ranges import PIXELS, above
 
 
 def convert_camera(
@@ -20,7 +20,7 @@ def convert_camera(
     size: Annotated[tuple[int, int] | None, PIXELS] = None,
     to: Literal["json", "vicalib", "opencv", "colmap", "ocamcalib", "intrinsics", "intrinsics4x4"] | None = None,
     mask: Path | None = None,
-    most_px: Annotated[float | None, at_least(0)] = None,
+    most_px: Annotated[float | None, above(0)] = None,
     overwrite: bool = False,
 ) -> None:
     """A calibration file in another format, or as another lens model, and by how many pixels that differs.
@@ -44,10 +44,6 @@ def convert_camera(
     check_files([output], overwrite, [file, mask])
     if most_px is not None and model is None:
         raise InputError("--most-px", "given without --model", "leave it out: it is of the fit of another lens model")
-    if size is not None and min(size) < 1:
-        raise InputError("--size", f"{list(size)}", "expected a width and a height of some pixels")
-    if most_px is not None and not most_px > 0:
-        raise InputError("--most-px", f"{most_px:g}", "expected a positive number of pixels")
     camera = read_camera(file, size)
     if size is not None and size != (camera.width, camera.height):
         if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > 0.01:
