@@ -84,7 +84,7 @@ def test_every_command_of_the_readme_is_understood(command):
 
 
 def test_the_commands_that_take_seconds_run_as_they_stand(tmp_path, monkeypatch):
-    frames = colon(0, 12).frames
+    frames = colon(0, 8).frames
     write_synthetic(frames, slam(frames), tmp_path / "data")
     write_folder(colon(1, 4).frames, tmp_path / "others")
     camera = frames[0].camera

@@ -10,7 +10,7 @@ from densify.evaluation.judged_map import read_run
 from densify.evaluation.records import Sources
 from densify.evaluation.tables import write_evaluations
 from densify.judged import JudgingConfig, TruthSource, judge_asked, read_asked
-from lightdepth.checkpoint import load_model
+from lightdepth.checkpoint import load_called
 from lightdepth.command_line.options import Group
 from lightdepth.reporting.run import recorded, run_folder
 
@@ -56,7 +56,7 @@ def evaluate(
         trajectory=trajectory,
     )
     asked = read_asked(run, source, judging, join, suite, trajectory, output is None, reading)
-    model = None if checkpoint is None else load_model(checkpoint, details=False)
+    model = None if checkpoint is None else load_called(checkpoint, details=False)
     gap = None if join is None else judge_gap(read_run(run), join)
     with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite or output is None) as out:
         out.hash_inputs(truth=source.truth)

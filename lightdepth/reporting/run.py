@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
@@ -33,7 +33,7 @@ from lightdepth.files.replacing import (
     unfinished_path,
 )
 from lightdepth.files.writing import sync_below
-from lightdepth.reporting.names import KEPT, Names, names_of
+from lightdepth.reporting.names import KEPT, Names, names_of, spoken
 from lightdepth.reporting.record import write_run_json
 from lightdepth.reporting.same import check_finished, check_same, compared
 from lightdepth.reporting.same import input_hash as input_hash
@@ -71,6 +71,7 @@ class Run:
         self._verb, self._given, self._start = verb, arguments, time.time()
         self._arguments = plain(arguments)
         self.keep_names = False
+        self._say: Callable[[str], str] | None = None
         self.unlisted: Mapping[str, Any] = {}  # inputs that do not stand among the arguments
 
     @property
@@ -119,8 +120,9 @@ class Run:
         return (self.parts or {})[part].kept
 
     def log(self, message: str) -> None:
-        """A line for the user and for log.txt."""
-        print(message, flush=True)
+        """A line for log.txt, and for the user, who reads the names of options in the place of their paths."""
+        self._say = self._say or (str if self.keep_names else spoken(self._given))
+        print(self._say(message), flush=True)
         self._note(message)
 
     def _note(self, message: str) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import lightning.pytorch as pl
 from safetensors.torch import load_file, save_file
 
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model, save_model
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called, save_model
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.detective import PairingConfig
@@ -92,7 +92,7 @@ def adapt(
         sfm=sfm,
         keep_worse=keep_worse,
     )
-    start = load_model(checkpoint, details=False)
+    start = load_called(checkpoint, details=False)
     if not isinstance(start, NetworkModel):
         raise InputError("--checkpoint", f"{checkpoint} has no weights to adapt", "expected a trained checkpoint")
     quiet()
