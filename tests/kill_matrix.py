@@ -29,9 +29,19 @@ ON_MAP = ("--map", "synth/slam", "--checkpoint", "decline")
 VERBS = (
     Verb("synth", ("synth", "-o", "out", "--frames", "4", "--size", "[48, 40]"), "out", ("--seed", "9")),
     Verb("import", ("import", "synth", "-o", "out", "--every", "2"), "out", ("--every", "3"), resumes=True),
-    Verb("calibrate-light", ("calibrate-light", "synth", "-o", "out/light.json", *ON_MAP[:2]), "out", overwrites=False),
-    Verb("convert-camera", ("convert-camera", "synth/camera.json", "-o", "out/camera.xml"), "out", overwrites=False),
-    Verb("select", ("select", "wide", "-o", "out/list.txt"), "out", overwrites=False),
+    Verb(
+        "calibrate-light",
+        ("calibrate-light", "synth", "-o", "out/light.json", *ON_MAP[:2]),
+        "out",
+        ("--seed", "5"),
+    ),
+    Verb(
+        "convert-camera",
+        ("convert-camera", "synth/camera.json", "-o", "out/camera.xml"),
+        "out",
+        ("--size", "[192, 160]"),
+    ),
+    Verb("select", ("select", "wide", "-o", "out/list.txt"), "out", ("--sift.ratio", "0.7")),
     Verb(
         "train", ("train", "--config", "train.yaml", "-o", "out"), "out", ("--seed", "5"), resumes=True, in_place=True
     ),
@@ -72,9 +82,21 @@ VERBS = (
     ),
     Verb(
         "measure",
-        ("measure", "dense", "-o", "out/lengths.json", "--map", "0", "--points", "[[0, 0, 30], [4, 2, 31]]"),
+        (
+            "measure",
+            "dense",
+            "-o",
+            "out/lengths.json",
+            "--map",
+            "0",
+            "--frame",
+            "2",
+            "--pixels",
+            "[[30, 30], [55, 45]]",
+        ),
         "out",
-        overwrites=False,
+        ("--pixels", "[[30, 30], [50, 50]]"),
+        again=(),
     ),
     Verb("export", ("export", "dense", "-o", "out", "--to", "ply"), "out", ("--to", "obj")),
     Verb("demo", ("demo", "-o", "out", "--frames", "8", "--size", "[96, 80]"), "out", ("--seed", "9")),

@@ -52,6 +52,8 @@ class Verb:
     older: tuple[str, ...] = ()
     """Options that make another result, which a run with --overwrite finds."""
     overwrites: bool = True
+    again: tuple[str, ...] = ("--overwrite",)
+    """Options with which a run replaces an older result."""
     resumes: bool = False
     in_place: bool = False
     """Whether the work is done in the output itself, which is complete when run.json is there."""
@@ -226,7 +228,7 @@ class Stage:
         if key not in self._references:
             folder = self._folder(f"{verb.name.replace(' ', '_')}-over")
             shutil.copytree(self.reference(verb, True)[0] / verb.output, folder / verb.output)
-            ended, events = run([*verb.argv, "--overwrite"], folder)
+            ended, events = run([*verb.argv, *verb.again], folder)
             assert ended.code == 0, f"{verb.name} --overwrite ends with {ended.code}:\n{ended.said}"
             found = unlike(folder / verb.output, self.reference(verb, False)[0] / verb.output)
             assert not found, f"{verb.name} --overwrite makes another result: {found}"
@@ -246,15 +248,15 @@ class Stage:
         older = self.reference(verb, True)[0] / verb.output if case.over else None
         if older is not None:
             shutil.copytree(older, folder / verb.output)
-        again = ["--overwrite"] if case.over else []
+        again = verb.again if case.over else ()
         ended, _ = run([*verb.argv, *again], folder, case.at, case.number)
         wrong = [*_after_the_signal(case, folder, reference / verb.output, older, ended)]
         wrong += self._inputs_changed(folder, verb)
-        resumes = ["--resume"] if verb.resumes else []
+        resumes = ("--resume",) if verb.resumes else ()
         if not verb.resumes and verb.overwrites and (folder / verb.output).exists():
-            resumes = ["--overwrite"]
-        if case.over and older is not None and _holds(folder / verb.output, older):
-            resumes = ["--overwrite"]
+            resumes = verb.again
+        if case.over and older is not None and not _goes_on(folder, verb) and _old_one(folder, verb, older):
+            resumes = verb.again
         restarted, _ = run([*verb.argv, *resumes], folder)
         if restarted.code:
             wrong.append(
@@ -309,10 +311,29 @@ def _after_the_signal(case: Case, folder: Path, made: Path, older: Path | None, 
         beside = [output, *(path for path in folder.iterdir() if path.name.startswith("."))]
         if not any(_holds(path, older) for path in beside) and (older / "run.json").is_file():
             yield "the old result is nowhere whole"
-    if number != signal.SIGKILL and not verb.resumes and ended.code:
-        names = {path.name for path in folder.iterdir() if path.name.startswith(".")}
-        for name in sorted(names):
+    if number != signal.SIGKILL and ended.code:
+        if older is not None and not _holds(output, older) and not _holds(output, made):
+            yield f"{verb.output} is not as it was after {number.name}"
+        if older is None and tried:
+            yield f"{verb.output} is left empty after {number.name}"
+        kept = {f".{verb.output}.unfinished"} if _goes_on(folder, verb) else set()
+        for name in sorted({path.name for path in folder.iterdir() if path.name.startswith(".")} - kept):
             yield f"{name} is left after {number.name}"
+
+
+def _goes_on(folder: Path, verb: Verb) -> bool:
+    """Whether a hidden run with a finished part or a checkpoint is there, which --resume has to go on with."""
+    made = folder / f".{verb.output}.unfinished"
+    parts = made / "parts.jsonl"
+    return (parts.is_file() and b"\n" in parts.read_bytes()) or any(made.glob("checkpoints/[!.]*.ckpt"))
+
+
+def _old_one(folder: Path, verb: Verb, older: Path) -> bool:
+    """Whether the older result is still the one, in its place or moved aside with no whole successor."""
+    if _holds(folder / verb.output, older):
+        return True
+    successor = (folder / f".{verb.output}.unfinished" / "run.json").is_file()
+    return not successor and _holds(folder / f".{verb.output}.old", older) and not (folder / verb.output).exists()
 
 
 def _holds(folder: Path, result: Path) -> bool:
