@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 import pytest
 
 from lightdepth.command_line.signals import ending_on_signals
-from lightdepth.errors import InputError, Interrupted
+from lightdepth.errors import AlreadyFinished, InputError, Interrupted
 from lightdepth.files.replacing import check_files, discard, old_path, unfinished_path
 from lightdepth.files.writing import write_together
+from lightdepth.reporting import run as reporting
 from lightdepth.reporting.run import run_folder
 from lightdepth.reporting.unfinished import Part, add_part, clean, finished_parts
 
@@ -185,6 +186,37 @@ def test_what_overwrite_had_begun_is_gone_on_with_while_the_old_result_still_sta
     with run_folder(out, "densify", {"seed": 4}, resume=True) as run:
         assert run.done("first")
     assert (out / "part.txt").read_text(encoding="utf-8") == "kept" and [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_run_stopped_or_killed_at_its_end_still_has_its_finished_parts(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+
+    def work(resume: bool) -> bool:
+        with run_folder(out, "densify", {}, resume=resume) as run:
+            if again := run.done("first"):
+                assert (run.state / "kept").is_file()
+            else:
+                run.state.mkdir()
+                (run.state / "kept").write_text("", encoding="utf-8")
+                run.finish_part("first", [run.state / "kept"])
+        return again
+
+    for step in ("sync_below", "write_run_json"):
+        with monkeypatch.context() as patched, suppress(KeyboardInterrupt):
+            patched.setattr(reporting, step, lambda *given: (_ for _ in ()).throw(KeyboardInterrupt))
+            work(False)
+        assert work(True)
+        assert sorted(p.name for p in out.rglob("*")) == ["config.yaml", "log.txt", "run.json"]
+        discard(out)
+    with monkeypatch.context() as patched, suppress(KeyboardInterrupt):  # killed when it was whole already
+        patched.setattr(reporting, "clear_notes", lambda *given: (_ for _ in ()).throw(KeyboardInterrupt))
+        patched.setattr(reporting, "discard", lambda folder: None)
+        patched.setattr(reporting, "_kept_or_gone", lambda *given: nullcontext())
+        work(False)
+    assert (unfinished_path(out) / ".state").is_dir()
+    with pytest.raises(AlreadyFinished):
+        work(True)
+    assert sorted(p.name for p in out.rglob("*")) == ["config.yaml", "run.json"]
 
 
 def test_a_run_killed_while_it_is_taken_up_again_keeps_its_finished_parts(tmp_path, monkeypatch):

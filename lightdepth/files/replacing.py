@@ -123,9 +123,17 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def listed(folder: Path) -> dict[str, int]:
-    """Every file below a folder, links too, with its size in bytes: names as run.json has them, in order."""
+    """Every file of a run, links too, with its size in bytes: names as run.json has them, in order."""
     own = {folder / name for name in (RECORD, BEGUN, PARTS)}
-    return {str(p.relative_to(folder)): p.lstat().st_size for p in sorted(_files(folder)) if p not in own}
+    found = (p for p in sorted(_files(folder)) if p not in own and not p.is_relative_to(folder / STATE))
+    return {str(p.relative_to(folder)): p.lstat().st_size for p in found}
+
+
+def clear_notes(folder: Path) -> None:
+    """Removes from a run that is whole what an unfinished one is resumed from."""
+    discard(folder / STATE)
+    for name in (BEGUN, PARTS):
+        (folder / name).unlink(missing_ok=True)
 
 
 def check_replaceable(output: Path, verb: str) -> None:
@@ -231,8 +239,7 @@ def _recover(output: Path) -> bool:
         os.rename(aside, output)
         return False
     if complete and empty:
-        for name in (BEGUN, PARTS):
-            (made / name).unlink(missing_ok=True)
+        clear_notes(made)
         move_whole(made, output)
     if aside.is_dir():
         _remove_old(aside, output)

@@ -20,11 +20,10 @@ from lightdepth.files.lock import locked
 from lightdepth.files.machine import machine_failure
 from lightdepth.files.named_inputs import write_inputs
 from lightdepth.files.replacing import (
-    BEGUN,
-    PARTS,
     STATE,
     check_apart,
     check_replaceable,
+    clear_notes,
     discard,
     real_output,
     recover,
@@ -205,7 +204,6 @@ class Run:
         """All files but run.json are as they stay, and on the disk."""
         import yaml
 
-        discard(self.state)
         self._named = names = self.names()
         settings = yaml.safe_dump(names.hidden(self._arguments, exactly=True), sort_keys=False)
         (self.folder / "config.yaml").write_text(settings, encoding="utf-8")
@@ -218,8 +216,7 @@ class Run:
     def finish(self) -> None:
         """The run says that it is whole."""
         write_run_json(self.folder, self._verb, self._arguments, self._start, self.record, self._named)
-        for name in (BEGUN, PARTS):
-            (self.folder / name).unlink(missing_ok=True)
+        clear_notes(self.folder)  # not before: a run that is killed until then goes on from its finished parts
 
 
 def recorded(*groups: object, **options: object) -> dict[str, object]:
