@@ -187,13 +187,15 @@ def cases(stage: Stage, verb: Verb, seed: int, count: int) -> list[Case]:
 
 
 def few_cases(stage: Stage, verb: Verb, seed: int) -> list[Case]:
-    """Four: at a rename into place and elsewhere, with an older result and without, by either kind of signal."""
+    """Four: at a rename into place and in a file, with an older result and without, by either kind of signal."""
     rng, found = random.Random(f"{seed} {verb.name}"), []
     soft = rng.choice([signal.SIGTERM, signal.SIGINT])
     for over in (False, True):
         events = stage.events(verb, over)
         renames = [i for i, event in enumerate(events) if event.places(verb.output)] or [len(events) - 1]
-        others = [i for i in range(len(events)) if i not in renames]
+        others = [i for i, event in enumerate(events) if event.kind == "opened"]
+        in_place = [i for i in others if events[i].paths[0].startswith(f"{verb.output}/")]
+        others = in_place or others  # the place of the result is where a file that is not whole would be seen
         for at, number in zip(
             (rng.choice(renames), rng.choice(others)),
             (soft, signal.SIGKILL) if over else (signal.SIGKILL, soft),
