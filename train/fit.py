@@ -37,7 +37,7 @@ from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit
 
 from .callbacks import validation_line
 from .card import Card, Doubt
-from .checkpoints import BEST, LAST, Start, newest
+from .checkpoints import BEST, LAST, Start, clear_cut_off, newest
 from .colons import TubeData
 from .datamodule import FrameDataModule
 from .folder import begin_in, first_process, has_checkpoint, training_folder
@@ -121,6 +121,7 @@ def _fitted(
     before = settings_before(folder) if start is not None else None
     if first_process():
         begin_in(folder)
+        clear_cut_off(folder / "checkpoints")
         settings = job.config_yaml
         if names.paths:
             write_inputs(folder, names.paths)

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError
 
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
@@ -24,16 +25,21 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 @contextmanager
 def locked(output: Path) -> Iterator[None]:
     """Within it no other run writes to `output`. Raises InputError, naming host, process and time, when one does."""
-    path = lock_path(output)
-    descriptor = _opened(path, output)
+    path, descriptor = lock_path(output), None
     try:
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
+        with finishing_first():
+            descriptor = _opened(path, output)
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
         yield
     finally:
-        if _is_at(descriptor, path):
-            path.unlink(missing_ok=True)  # while it is held: whoever waits for it sees that it is gone
-        os.close(descriptor)
+        if descriptor is not None:
+            with finishing_first():
+                try:
+                    if _is_at(descriptor, path):
+                        path.unlink(missing_ok=True)  # while it is held: whoever waits for it sees that it is gone
+                finally:
+                    os.close(descriptor)
 
 
 def lock_path(output: Path) -> Path:

@@ -19,7 +19,7 @@ from typing import Any
 
 from lightdepth.command_line.config_words import configs
 from lightdepth.files.named_inputs import INPUTS, real_inputs
-from lightdepth.files.replacing import BEGUN, PARTS
+from lightdepth.files.replacing import BEGUN, PARTS, STATE
 from lightdepth.files.writing import PARTIAL
 from lightdepth.reporting.same import input_hash
 
@@ -93,7 +93,8 @@ class Names:
         """Puts names in the place of paths in the texts of a run folder in the making."""
         if not self._forms:
             return
-        for place, _, files in os.walk(folder):
+        for place, folders, files in os.walk(folder):
+            folders[:] = [name for name in folders if name != STATE]
             for name in files:
                 path = Path(place) / name
                 if path.suffix.lower() in TEXTS and name not in (INPUTS, BEGUN, PARTS) and not path.is_symlink():

@@ -79,7 +79,7 @@ def finished_parts(folder: Path) -> dict[str, Part]:
 
 def clean(folder: Path, parts: Mapping[str, Part]) -> None:
     """Removes what belongs to no finished part, so that the rest is made as if for the first time."""
-    ours = {name for part in parts.values() for name in part.files} | {BEGUN, LOG}
+    ours = {name for part in parts.values() for name in part.files} | {BEGUN, PARTS, LOG}
     for place, _, names in os.walk(folder, topdown=False):
         for name in names:
             path = Path(place) / name
