@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= runs/demo
 export OMP_WAIT_POLICY = passive
 
-.PHONY: setup demo test test-slow fuzz mutants kill coverage lint format bench same ablation clean
+.PHONY: setup demo test test-slow fuzz mutants kill soak offline coverage lint format bench same ablation clean
 
 setup: $(VENV)/.ready
 
@@ -49,6 +49,15 @@ mutants: setup
 # Every verb killed at drawn events of the file system; hours. What was played is kept: make kill SEED=2 ONLY=predict,train
 kill: setup
 	$(BIN)/python tests/kill_matrix.py --seed $(or $(SEED),1) --only "$(ONLY)"
+
+# 2000 keyframes live and 200 sequences in one process, every tenth failing: what grows? About five minutes of one core.
+soak: setup
+	OMP_NUM_THREADS=1 $(BIN)/python tests/soak.py
+
+# The demo and the tests without network, home, name or a place to write packages: make offline WHAT="make demo"
+WHAT ?=
+offline: setup
+	bash tests/offline.sh $(WHAT)
 
 lint: setup
 	$(BIN)/ruff check .

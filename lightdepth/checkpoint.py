@@ -242,7 +242,8 @@ def _rows(found: dict[str, Any], path: Path) -> int:
 
 
 def _network(config: NetworkConfig, weights: dict[str, Tensor], path: Path) -> DepthNetwork:
-    network = build_network(config)
+    with torch.random.fork_rng(devices=[]):  # first weights are drawn, and go at once: a caller's own chance stays
+        network = build_network(config)
     weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
     if not all(torch.isfinite(value).all() for value in weights.values()):
         raise InputError(path, "weights are not all finite", "its training failed: take an earlier checkpoint")
