@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lightdepth.judge_colons.colons import JUDGE_COLONS, JudgeColon, JudgeFrame, judge_frames
+from lightdepth.judge_colons.corruption import CORRUPTIONS, SEVERITIES, corrupted
 from lightdepth.judge_colons.lamps import Lamp, measured_light, vignetting
 from lightdepth.judge_colons.skin import Skin
 from lightdepth.judge_colons.transport import (
@@ -197,3 +198,16 @@ def test_the_judge_knows_nothing_of_what_trains():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module == "lightdepth.photometry":
                 assert [alias.name for alias in node.names] == ["PhotometricCalibration"], path.name
+
+
+@pytest.mark.parametrize("corruption", CORRUPTIONS)
+def test_a_frame_is_spoilt_the_same_twice_and_more_with_each_severity(corruption):
+    frame = small()[0].frame
+    found = [corrupted(frame, corruption, severity, np.random.default_rng(5)) for severity in SEVERITIES]
+    again = corrupted(frame, corruption, 5, np.random.default_rng(5))
+    assert np.array_equal(found[-1].image, again.image) and frame.mask is not None
+    off = [np.abs(spoilt.image - frame.image)[frame.mask].mean() for spoilt in found]
+    assert 0 <= off[0] < off[2] < off[4]  # so small an image is hardly blurred by the first
+    for spoilt in found:
+        assert np.array_equal(spoilt.image[~frame.mask], frame.image[~frame.mask])
+        assert spoilt.image.min() >= 0 and spoilt.image.max() <= 1 and spoilt.true_distance is frame.true_distance

@@ -21,6 +21,7 @@ from lightdepth.datasets import FrameSequence, read_folder, write_folder
 from lightdepth.errors import InputError
 from lightdepth.files.images import to_bgr8, write_image
 from lightdepth.files.schema import read_json
+from lightdepth.frame import Frame
 from lightdepth.judge_colons import JudgeColon, judge_frames
 from lightdepth.judge_colons.colons import STRONG, VERSION
 from lightdepth.models import DepthModel
@@ -78,7 +79,7 @@ def read_colon(colon: JudgeColon, folder: Path) -> FrameSequence:
     return read_folder(folder)
 
 
-def judged(colon: JudgeColon, frames: FrameSequence, models: Sequence[DepthModel]) -> list[ColonFigures]:
+def judged(colon: JudgeColon, frames: Sequence[Frame], models: Sequence[DepthModel]) -> list[ColonFigures]:
     """Each model's figures on a colon."""
     rows = []
     for model in models:
@@ -120,7 +121,11 @@ def record(rows: Sequence[ColonFigures]) -> dict[str, object]:
 def tables(rows: Sequence[ColonFigures]) -> list[Table]:
     """Means by bounce, each colon's ratio to the closed form, and the coverage of stated intervals."""
     models = [name for name in dict.fromkeys(row.model for row in rows) if name != BASELINE]
-    return [*(_means(rows, strong) for strong in (True, False)), _ratios(rows, models), *_intervals(rows, models)]
+    return [
+        *(_means(rows, strong) for strong in (True, False) if _of(rows, BASELINE, strong)),
+        _ratios(rows, models),
+        *_intervals(rows, models),
+    ]
 
 
 def _of(rows: Sequence[ColonFigures], model: str, strong: bool | None = None) -> list[ColonFigures]:

@@ -23,6 +23,7 @@ from densify.bench.estimators import (
 )
 from densify.bench.record import notes, read_bench, record, tables
 from densify.bench.scenes import Size, scenes
+from densify.bench.spoilt import SpoiltFrame, spoilt_frames, spoilt_tables
 from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, cells_of, load_models, predicted
 from densify.config import DensifyConfig, OfflineConfig, Recipe
@@ -214,6 +215,7 @@ def compare_per_frame(
     output: Path = Path("runs/per-frame"),
     checkpoints: tuple[str, ...] = (DEFAULT_CHECKPOINT, "lightdepth-self"),
     colons: Path | None = None,
+    spoilt: bool = False,
     overwrite: bool = False,
     resume: bool = False,
 ) -> None:
@@ -226,12 +228,15 @@ def compare_per_frame(
             is always the first row.
         colons: Folder colons/ of an earlier run, whose frames are taken in place of making them anew, which takes some
             ten minutes.
+        spoilt: Judge frames with blur, smoke, water drops, clipping, noise and compression too, at five severities:
+            error, and the share that import would keep; some minutes more for each model.
         overwrite: Replace a run made before.
         resume: Go on with the run that was stopped there, as it was begun; colons that were judged are not made again.
     """
-    arguments = recorded(output=output, checkpoints=checkpoints, colons=colons)
+    arguments = recorded(output=output, checkpoints=checkpoints, colons=colons, spoilt=spoilt)
     models = load_models(tuple(dict.fromkeys((per_frame.BASELINE, *checkpoints))))
     rows: list[per_frame.ColonFigures] = []
+    bad: list[SpoiltFrame] = []
     with run_folder(output, "bench per-frame", arguments, overwrite, resume) as folder:
         folder.hash_inputs(colons=colons, **{checkpoint: Path(checkpoint) for checkpoint in checkpoints})
         sequences = []
@@ -240,12 +245,16 @@ def compare_per_frame(
                 place = (folder.folder / "colons" if colons is None else colons) / colon.name
                 if not folder.done(colon.name):
                     files = per_frame.write_colon(colon, place, bar.advance) if colons is None else []
-                    judged = per_frame.judged(colon, per_frame.read_colon(colon, place), models)
-                    folder.finish_part(colon.name, files, [asdict(row) for row in judged])
+                    frames = per_frame.read_colon(colon, place)
+                    kept = [asdict(row) for row in per_frame.judged(colon, frames, models)]
+                    more = [asdict(row) for row in spoilt_frames(colon, frames, models)] if spoilt else []
+                    folder.finish_part(colon.name, files, {"clean": kept, "spoilt": more})
                 sequences.append(per_frame.read_colon(colon, place))
-                rows += [per_frame.ColonFigures(**row) for row in folder.kept_of(colon.name)]
-        text = "\n".join(table.markdown() for table in per_frame.tables(rows))
-        _write_json(folder, "per-frame.json", per_frame.record(rows) | {"versions": versions()})
+                rows += [per_frame.ColonFigures(**row) for row in folder.kept_of(colon.name)["clean"]]
+                bad += [SpoiltFrame(**row) for row in folder.kept_of(colon.name)["spoilt"]]
+        text = "\n".join(table.markdown() for table in [*per_frame.tables(rows), *spoilt_tables(bad)])
+        found = per_frame.record(rows) | {"spoilt": [asdict(row) for row in bad], "versions": versions()}
+        _write_json(folder, "per-frame.json", found)
         (folder.folder / "per-frame.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         write_image(folder.folder / "colons.png", per_frame.contact_sheet(sequences))
         folder.log(text)
