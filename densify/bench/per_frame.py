@@ -143,11 +143,12 @@ def _means(rows: Sequence[ColonFigures], strong: bool) -> Table:
             ratios = values / plain
             cells.append(f"{int((ratios < 1).sum())}, {int((ratios <= BARS[name]).sum())} of {len(ratios)}")
         found.append([*cells, float(np.mean([row.share_of_truth for row in mine]))])
-    titles = [f"{title}{more}" for title in ERRORS.values() for more in ("", " / closed form", ": below it, below bar")]
+    titles = [heading for title in ERRORS.values() for heading in (title, "ratio", "below 1, bar")]
     bounce = f"strong bounce (reflectance above {STRONG:g})" if strong else f"weak bounce (up to {STRONG:g})"
     bars = ", ".join(f"{title} {BARS[name]:g}" for name, title in ERRORS.items())
     return Table(
-        f"{bounce}, {len(base)} colons, mean over colons; {UNIT}; ratios are those of the means, bars {bars}",
+        f"{bounce}, {len(base)} colons, mean over colons; {UNIT}. Ratios are of the means, to the closed form's; then "
+        f"on how many colons the ratio is below 1, and at most the bar ({bars})",
         ["model", *titles, "judged share"],
         found,
     )

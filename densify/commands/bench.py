@@ -248,7 +248,11 @@ def compare_per_frame(
                     frames = per_frame.read_colon(colon, place)
                     kept = [asdict(row) for row in per_frame.judged(colon, frames, models)]
                     more = [asdict(row) for row in spoilt_frames(colon, frames, models)] if spoilt else []
+                    if not files:
+                        bar.advance(colon.frames)
                     folder.finish_part(colon.name, files, {"clean": kept, "spoilt": more})
+                else:
+                    bar.advance(colon.frames)
                 sequences.append(per_frame.read_colon(colon, place))
                 rows += [per_frame.ColonFigures(**row) for row in folder.kept_of(colon.name)["clean"]]
                 bad += [SpoiltFrame(**row) for row in folder.kept_of(colon.name)["spoilt"]]

@@ -65,7 +65,7 @@ JUDGE_COLONS = (
     JudgeColon("judge07", 907, 0.48, "bright", "plain", 2.2, (128, 96)),
     JudgeColon("judge08", 908, 0.56, "dark", "fisheye", 2.4, (160, 128)),
     JudgeColon("judge09", 909, 0.64, "clipped", "circle", 2.2, (144, 120)),
-    JudgeColon("judge10", 910, 0.72, "even", "barrel", 1.8, (160, 120)),
+    JudgeColon("judge10", 930, 0.72, "even", "barrel", 1.8, (160, 120)),
     JudgeColon("judge11", 911, 0.81, "clipped", "narrow", 2.2, (128, 96)),
     JudgeColon("judge12", 912, 0.90, "bright", "fisheye", 1.0, (144, 120)),
 )
