@@ -22,7 +22,7 @@ SEVERITIES = (1, 2, 3, 4, 5)
 
 _BLUR = (0.006, 0.012, 0.02, 0.032, 0.05)  # deviation; half of them smeared along a line as by motion
 _SMOKE = (0.06, 0.14, 0.26, 0.42, 0.6)  # share of light that the smoke swallows, and gives back as its own
-_DROPS = (0.03, 0.07, 0.13, 0.2, 0.3)  # share of the image that lies under drops
+_DROPS = (0.03, 0.07, 0.13, 0.2, 0.3)  # share of the wall's image that lies under drops
 _GAIN = (1.3, 1.7, 2.4, 3.6, 6.0)
 _NOISE = (0.01, 0.022, 0.045, 0.08, 0.14)  # deviation of linear light at a quarter of white
 _QUALITY = (60, 35, 20, 12, 6)
@@ -70,8 +70,8 @@ def _drops(frame: Frame, level: int, rng: np.random.Generator) -> np.ndarray:
     v, u = np.mgrid[:height, :width].astype(np.float32)
     blurred = cv2.GaussianBlur(frame.image, (0, 0), 0.02 * height)
     spoilt, covered = frame.image.copy(), np.zeros((height, width), bool)
-    while covered.mean() < _DROPS[level]:
-        x, y, size = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0.03, 0.13) * height
+    while covered[frame.valid].mean() < _DROPS[level]:
+        x, y, size = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0.04, 0.2) * height
         stretch = rng.uniform(0.8, 1.25)
         off = np.hypot((u - x) * stretch, (v - y) / stretch) / size
         inside = off < 1
