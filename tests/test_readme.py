@@ -75,8 +75,10 @@ def test_every_command_of_the_readme_is_understood(command):
         else:
             from densify.commands import bench
 
-            name = words.pop(0) if words[0] in ("compare", "estimators") else ""
-            function = {"compare": bench.compare_runs, "estimators": bench.compare_estimators}.get(name, bench.run)
+            ways = {"compare": bench.compare_runs, "estimators": bench.compare_estimators}
+            ways["per-frame"] = bench.compare_per_frame
+            name = words.pop(0) if words[0] in ways else ""
+            function = ways.get(name, bench.run)
             parser = verb_parser(function, f"bench {name}".strip())
     else:
         parser = verb_parser(entry.load(), verb)

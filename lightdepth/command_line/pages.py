@@ -152,6 +152,12 @@ PAGES = {
             "lightdepth bench estimators -o runs/estimators --draws 200 --points 50",
         )
     ),
+    "bench per-frame": Page(
+        (
+            "lightdepth bench per-frame -o runs/per-frame",
+            "lightdepth bench per-frame -o runs/mine --colons runs/per-frame/colons --checkpoints '[mine.safetensors]'",
+        )
+    ),
     "measure": Page(
         (
             "lightdepth measure runs/dense --points '[[0, 0, 30], [4, 2, 41]]' --mm-per-unit 3.1",
