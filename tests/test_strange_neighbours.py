@@ -127,6 +127,13 @@ def test_pipes_with_our_names_are_not_waited_for(tmp_path):
         make(tmp_path / "out", resume=True)
 
 
+def test_an_input_that_gives_without_end_or_never_is_not_read_to_its_end(tmp_path):
+    os.mkfifo(tmp_path / "camera.json")
+    for path, kind in ((Path("/dev/zero"), "a device"), (tmp_path / "camera.json", "a named pipe")):
+        with refused(kind, "not a file"), run_folder(tmp_path / "out", "densify", {}) as run:
+            run.hash_inputs(mask=path)
+
+
 @pytest.mark.parametrize("umask", [0o077, 0o027, 0o002])
 def test_who_may_read_a_result_is_as_the_umask_and_the_folder_s_group_say(tmp_path, umask):
     (tmp_path / "shared").mkdir()

@@ -15,6 +15,7 @@ from lightdepth.errors import AlreadyFinished, InputError
 from lightdepth.files.below import files_below
 from lightdepth.files.named_inputs import INPUTS, TOKEN, with_real_inputs
 from lightdepth.files.replacing import read_record
+from lightdepth.regular import regular
 
 
 def check_finished(output: Path, verb: str, arguments: Mapping[str, Any]) -> None:
@@ -87,7 +88,7 @@ def input_hash(path: Path, without: Path | None = None) -> str:
     if not path.exists():
         raise InputError(path, "no such file or folder", "correct its name, or put it there")
     digest = hashlib.sha256()
-    files = files_below(path, without) if path.is_dir() else [path]
+    files = files_below(path, without) if path.is_dir() else [regular(path)]
     read = 1 << 20 if path.is_dir() else 1 << 30
     for file in files:
         size = file.stat().st_size
