@@ -6,7 +6,9 @@ import ast
 from pathlib import Path
 
 import lightning.pytorch as pl
+from raising import refused
 
+from train.fit import _refusals_named
 from train.running import NO_ROOT
 from train.watching import with_callbacks
 
@@ -22,6 +24,11 @@ def test_no_checkpoint_that_lies_about_is_taken_on_a_cluster(tmp_path, monkeypat
     for given, taken in (({}, True), ({"default_root_dir": NO_ROOT}, False)):
         trainer = pl.Trainer(devices=1, accelerator="cpu", logger=False, enable_checkpointing=False, **given)
         assert bool(trainer._checkpoint_connector._hpc_resume_path) == taken
+
+
+def test_a_job_that_lightning_cannot_run_in_is_told_as_a_mistake():
+    with refused("--ntasks-per-node"), _refusals_named(RuntimeError):
+        raise RuntimeError("You set `--ntasks=4`. HINT: Use `--ntasks-per-node=4` instead.")
 
 
 def test_every_trainer_has_no_folder_of_its_own():
