@@ -135,7 +135,7 @@ def _fitted(
     checkpoints = folder / "checkpoints"
     with finishing_first() as received:
         options = _with_callbacks(trainer_options, folder, echo, data, job.settings, received, start)
-        with _refusals_named(MisconfigurationException, ValueError, TypeError):
+        with _refusals_named(MisconfigurationException, ValueError, TypeError, RuntimeError):  # the last: of a cluster
             trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the parser checked them against Trainer
         if job.resume:
             echo(start.said if start else "nothing to resume: starting anew")

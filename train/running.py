@@ -7,6 +7,10 @@ import warnings
 
 import torch
 
+NO_ROOT = "/dev/null/no-root"
+"""Lightning's folder for what we write ourselves; none can be there. On a cluster it would take the weights of any
+`hpc_ckpt_*.ckpt` that lies in it, and where none is given it is the one that the user is in."""
+
 
 def report_every(steps: int) -> int:
     return 50 if steps <= 0 else max(1, min(100, steps // 10))

@@ -114,18 +114,23 @@ def try_place(output: Path) -> None:
 
 def read_record(folder: Path) -> dict[str, Any] | None:
     """The run.json of a folder that this program wrote, or None."""
+    if not (folder / RECORD).is_file():
+        return None  # a pipe would be waited for
     try:
         found = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    ours = isinstance(found, dict) and isinstance(found.get("verb"), str) and isinstance(found.get("versions"), dict)
-    return found if ours else None
+    kinds = {"verb": str, "versions": dict}
+    if not (isinstance(found, dict) and all(isinstance(found.get(name), kind) for name, kind in kinds.items())):
+        return None
+    whole = all(isinstance(found.get(name, {}), dict) for name in ("arguments", "inputs"))
+    return found if whole and all(isinstance(known, dict) for known in found.get("inputs", {}).values()) else None
 
 
 def listed(folder: Path) -> dict[str, int]:
     """Every file of a run, links too, with its size in bytes: names as run.json has them, in order."""
     own = {folder / name for name in (RECORD, BEGUN, PARTS)}
-    found = (p for p in sorted(_files(folder)) if p not in own and not p.is_relative_to(folder / STATE))
+    found = (p for p in sorted(below(folder)) if p not in own and not p.is_relative_to(folder / STATE))
     return {str(p.relative_to(folder)): p.lstat().st_size for p in found}
 
 
@@ -148,7 +153,7 @@ def check_replaceable(output: Path, verb: str) -> None:
         found = "not overwritten, its run.json is of an earlier version and does not say which files are the run's"
         raise InputError(output, found, cure)
     ours = _owned(output)
-    for path in sorted(_files(output)):
+    for path in sorted(below(output)):
         if path not in ours:
             found = f"not overwritten, {path.relative_to(output)} in it is not of the run that made it"
             raise InputError(output, found, "move that file elsewhere, or choose another -o")
@@ -230,7 +235,7 @@ def recover(output: Path) -> bool:
 def _recover(output: Path) -> bool:
     made, aside = unfinished_path(output), old_path(output)
     for path in (made, aside):
-        if path.exists() and not _is_of_a_run(path):
+        if os.path.lexists(path) and not _is_of_a_run(path):
             found = f"{path.name} beside it is in the way, and was not made by this program"
             raise InputError(output, found, "rename it, or choose another -o")
     complete = read_record(made) is not None
@@ -254,7 +259,7 @@ def _remove_old(aside: Path, output: Path) -> None:
 
 def remove_owned(folder: Path) -> bool:
     """Removes the files of a run, and no others; returns whether the folder is gone."""
-    ours = _owned(folder) & set(_files(folder))  # not through links
+    ours = _owned(folder) & set(below(folder))  # not through links
     records = {path for path in ours if path.name == RECORD}
     for path in [
         *sorted(ours - records),
@@ -306,11 +311,13 @@ def output_of(path: Path) -> Path | None:
 
 
 def _is_of_a_run(path: Path) -> bool:
-    """Whether what has such a name was written by this program: others hide files too."""
+    """Whether what has such a name was written by this program: others hide files too, and a link leads to theirs."""
+    if path.is_symlink():
+        return False
     if path.is_dir():
         said = (path / BEGUN).is_file() or read_record(path) is not None
         # A run killed at its first or last step: its list is not there yet, or is gone and folders alone are left.
-        return said or all(f.name.startswith(PARTIAL) and f.name.endswith(BEGUN) for f in _files(path))
+        return said or all(f.name.startswith(PARTIAL) and f.name.endswith(BEGUN) for f in below(path))
     return path == lock_path(output_of(path) or path) and is_lock(path)
 
 
@@ -329,13 +336,14 @@ def _owned(folder: Path) -> set[Path]:
             path = Path(place) / name
             if ".." in path.parts or not path.is_relative_to(folder):  # a list that another wrote
                 continue
-            with suppress(OSError):
+            with suppress(OSError, ValueError):  # a text that is no name
                 if path.lstat().st_size == size:
                     owned.add(path)
     return owned
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def below(folder: Path) -> Iterator[Path]:
+    """The files below a folder, and links to folders, which are not followed."""
     for place, folders, names in os.walk(folder):
         yield from (Path(place) / name for name in names)
         yield from (Path(place) / name for name in folders if (Path(place) / name).is_symlink())

@@ -12,6 +12,7 @@ import hashlib
 import os
 import re
 import socket
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -106,6 +107,17 @@ def check_writable(path: Path) -> None:
         if error.errno in FAILS:
             raise
         raise InputError(path, f"cannot be written ({error.strerror or error})", "choose another place") from error
+
+
+def usual_mode(folder: Path) -> int:
+    """The mode that a new folder inside this one gets: by the umask, which says who may read what the user makes, and
+    by what a folder of a group hands on."""
+    probe = folder / f"{PARTIAL}mode"
+    probe.mkdir(exist_ok=True)
+    try:
+        return stat.S_IMODE(probe.stat().st_mode)
+    finally:
+        probe.rmdir()
 
 
 def move_whole(made: Path, path: Path) -> None:

@@ -6,6 +6,7 @@ files. A verb that fails leaves OUT as it was; one that can be resumed keeps its
 
 from __future__ import annotations
 
+import stat
 import sys
 import time
 import warnings
@@ -32,10 +33,10 @@ from lightdepth.files.replacing import (
     try_place,
     unfinished_path,
 )
-from lightdepth.files.writing import folders_for, sync_below
+from lightdepth.files.writing import folders_for, sync_below, usual_mode
 from lightdepth.reporting.names import KEPT, Names, names_of, spoken
 from lightdepth.reporting.record import write_run_json
-from lightdepth.reporting.same import check_finished, check_same, compared
+from lightdepth.reporting.same import check_finished, check_same, compared, own_version
 from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
 from lightdepth.reporting.same import plain as plain
@@ -165,7 +166,8 @@ class Run:
 
     def begin(self, inputs: Mapping[str, Any] | None = None) -> None:
         """Notes what the run is begun with."""
-        begin(self.folder, {"verb": self._verb, "arguments": compared(self._arguments), "inputs": inputs or {}})
+        said = {"verb": self._verb, "version": own_version(), "arguments": compared(self._arguments)}
+        begin(self.folder, {**said, "inputs": inputs or {}})
 
     @contextmanager
     def hearing(self) -> Iterator[None]:
@@ -212,7 +214,7 @@ class Run:
         names.hide_below(self.folder)
         if names.paths:
             write_inputs(self.folder, names.paths)
-        self.folder.chmod(0o755)
+        self.folder.chmod(usual_mode(self.folder))
         sync_below(self.folder)  # run.json says that the rest is whole: it comes last
 
     def finish(self) -> None:
@@ -323,7 +325,8 @@ def _begin(run: Run) -> None:
         run.log(f"resumed: {len(run.parts)} finished part(s) are kept")
         return
     run.folder.mkdir(mode=0o700)
-    run.folder.chmod(0o700)  # until it is finished its files name the inputs
+    special = stat.S_IMODE(run.folder.stat().st_mode) & ~0o777  # a folder of a group hands its group on
+    run.folder.chmod(special | 0o700)  # until it is finished its files name the inputs
     run.begin()
 
 

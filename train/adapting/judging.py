@@ -23,6 +23,7 @@ from lightdepth.module import MIN_RAY_Z
 from lightdepth.reporting.report import number
 
 from ..datamodule import FrameDataModule, held_out_count
+from ..running import NO_ROOT
 from .module import Adaptation
 from .wall_judge import WallErrors, WallJudge, compared
 
@@ -216,6 +217,7 @@ def judged(
     map's blocks."""
     trainer = pl.Trainer(
         devices=1,
+        default_root_dir=NO_ROOT,
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,

@@ -36,7 +36,7 @@ from ..adapting.target import Target, adaptation, frame_data, read_target, repla
 from ..adapting.wall_judge import compared, wall_judge
 from ..callbacks import Diagnosis, DiagnosisConfig, TrainingProgress
 from ..datamodule import FrameDataModule
-from ..running import quiet, report_every
+from ..running import NO_ROOT, quiet, report_every
 
 
 def adapt(
@@ -142,6 +142,7 @@ def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> Non
         return
     trainer = pl.Trainer(
         devices=1,
+        default_root_dir=NO_ROOT,
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
