@@ -9,7 +9,7 @@ import lightning.pytorch as pl
 from raising import refused
 
 from train.fit import _refusals_named
-from train.running import NO_ROOT
+from train.running import NO_ROOT, trainer_of_one
 from train.watching import with_callbacks
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -31,6 +31,12 @@ def test_a_job_that_lightning_cannot_run_in_is_told_as_a_mistake():
         raise RuntimeError("You set `--ntasks=4`. HINT: Use `--ntasks-per-node=4` instead.")
 
 
+def test_adapting_is_of_one_process_whatever_the_job_has(monkeypatch):
+    for name, value in {"JOB_ID": "7", "NTASKS": "4", "JOB_NAME": "batch"}.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    assert trainer_of_one(max_steps=1).world_size == 1
+
+
 def test_every_trainer_has_no_folder_of_its_own():
     called = [
         node
@@ -39,5 +45,5 @@ def test_every_trainer_has_no_folder_of_its_own():
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("pl.Trainer", "Trainer")
     ]
     given = [{word.arg: ast.unparse(word.value) for word in call.keywords} for call in called]
-    assert len(given) >= 3 and all(words.get("default_root_dir") == "NO_ROOT" or None in words for words in given)
+    assert len(given) >= 2 and all(words.get("default_root_dir") == "NO_ROOT" or None in words for words in given)
     assert "NO_ROOT" in with_callbacks.__code__.co_names  # of the one whose options are put together elsewhere

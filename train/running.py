@@ -4,12 +4,29 @@ from __future__ import annotations
 
 import logging
 import warnings
+from typing import Any
 
+import lightning.pytorch as pl
 import torch
+from lightning.pytorch.plugins.environments import LightningEnvironment
 
 NO_ROOT = "/dev/null/no-root"
 """Lightning's folder for what we write ourselves; none can be there. On a cluster it would take the weights of any
 `hpc_ckpt_*.ckpt` that lies in it, and where none is given it is the one that the user is in."""
+
+
+def trainer_of_one(**options: Any) -> pl.Trainer:
+    """A Trainer of one process that writes nothing, also in a job of a cluster that has more."""
+    return pl.Trainer(
+        devices=1,
+        plugins=[LightningEnvironment()],
+        default_root_dir=NO_ROOT,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        **options,
+    )
 
 
 def report_every(steps: int) -> int:

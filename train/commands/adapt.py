@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import lightning.pytorch as pl
 from safetensors.torch import load_file, save_file
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called, save_model
@@ -36,7 +35,7 @@ from ..adapting.target import Target, adaptation, frame_data, read_target, repla
 from ..adapting.wall_judge import compared, wall_judge
 from ..callbacks import Diagnosis, DiagnosisConfig, TrainingProgress
 from ..datamodule import FrameDataModule
-from ..running import NO_ROOT, quiet, report_every
+from ..running import quiet, report_every, trainer_of_one
 
 
 def adapt(
@@ -140,13 +139,7 @@ def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> Non
     if run.done("training"):
         module.network.load_state_dict(load_file(run.state / "trained.safetensors"))
         return
-    trainer = pl.Trainer(
-        devices=1,
-        default_root_dir=NO_ROOT,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
+    trainer = trainer_of_one(
         max_steps=steps,
         gradient_clip_val=1.0,
         limit_val_batches=0,
