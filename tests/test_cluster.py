@@ -34,7 +34,7 @@ def test_a_job_that_lightning_cannot_run_in_is_told_as_a_mistake():
 def test_adapting_is_of_one_process_whatever_the_job_has(monkeypatch):
     for name, value in {"JOB_ID": "7", "NTASKS": "4", "JOB_NAME": "batch"}.items():
         monkeypatch.setenv(f"SLURM_{name}", value)
-    assert trainer_of_one(max_steps=1).world_size == 1
+    assert trainer_of_one(1).world_size == 1
 
 
 def test_every_trainer_has_no_folder_of_its_own():

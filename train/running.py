@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import logging
 import warnings
-from typing import Any
+from collections.abc import Sequence
 
 import lightning.pytorch as pl
 import torch
-from lightning.pytorch.plugins.environments import LightningEnvironment
+from lightning.fabric.plugins.environments import LightningEnvironment
 
 NO_ROOT = "/dev/null/no-root"
 """Lightning's folder for what we write ourselves; none can be there. On a cluster it would take the weights of any
 `hpc_ckpt_*.ckpt` that lies in it, and where none is given it is the one that the user is in."""
 
 
-def trainer_of_one(**options: Any) -> pl.Trainer:
-    """A Trainer of one process that writes nothing, also in a job of a cluster that has more."""
+def trainer_of_one(steps: int = 0, callbacks: Sequence[pl.Callback] = ()) -> pl.Trainer:
+    """A Trainer of one process that writes nothing, also in a job of a cluster that has more: for so many steps without
+    validation, or, with none, to validate."""
     return pl.Trainer(
         devices=1,
         plugins=[LightningEnvironment()],
@@ -25,7 +26,11 @@ def trainer_of_one(**options: Any) -> pl.Trainer:
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        **options,
+        max_steps=steps or -1,
+        gradient_clip_val=1.0,
+        limit_val_batches=0 if steps else None,
+        log_every_n_steps=1,
+        callbacks=list(callbacks),
     )
 
 

@@ -139,13 +139,8 @@ def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> Non
     if run.done("training"):
         module.network.load_state_dict(load_file(run.state / "trained.safetensors"))
         return
-    trainer = trainer_of_one(
-        max_steps=steps,
-        gradient_clip_val=1.0,
-        limit_val_batches=0,
-        log_every_n_steps=1,
-        callbacks=[Diagnosis(DiagnosisConfig(), data.names), TrainingProgress(run.log, report_every(steps))],
-    )
+    told = [Diagnosis(DiagnosisConfig(), data.names), TrainingProgress(run.log, report_every(steps))]
+    trainer = trainer_of_one(steps, told)
     trainer.fit(module, datamodule=data)
     if run.resumable:
         run.state.mkdir(exist_ok=True)
