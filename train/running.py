@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import lightning.pytorch as pl
 import torch
-from lightning.fabric.plugins.environments import LightningEnvironment
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 
 NO_ROOT = "/dev/null/no-root"
 """Lightning's folder for what we write ourselves; none can be there. On a cluster it would take the weights of any
