@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
+from densify.additions import additions, said
 from densify.config import DensifyConfig
 from densify.dense_map import map_folders
 from densify.densified import Densified, note_recipe
@@ -112,6 +113,11 @@ class DenseFirst:
     """recipe and settings"""
     fit_light: bool = True
     """whether the light is fitted on each map, where nobody gave it"""
+
+    def __str__(self) -> str:
+        light = "fitted on each map where nobody gave it" if self.fit_light else "as given, else assumed"
+        more = f". {said(additions(self.config))}" if self.config.recipe == "paper" else ""
+        return f"Sparse maps were made dense by {self.model.name}, recipe {self.config.recipe}, light {light}{more}"
 
 
 def check_used(checkpoint: str | None, source: TruthSource, config: DensifyConfig, fit_light: bool) -> None:

@@ -126,7 +126,10 @@ def test_a_suite_takes_recipe_settings_and_light_as_densify_does(trees, tmp_path
             evaluate(maps, trees[0], tmp_path / name, **given, **more)
         record = json.loads((tmp_path / name / "run.json").read_text())
         assert ("light_fits" in record) is (name == "fitted") and ("recipe" in record) is (name != "fitted")
-        figures[name] = json.loads((tmp_path / name / "metrics.json").read_text())["all"]["dense"]
+        metrics = json.loads((tmp_path / name / "metrics.json").read_text())
+        assert f"by decline, recipe {more['recipe']}" in metrics["made_dense"]
+        assert metrics["made_dense"] in (tmp_path / name / "metrics.md").read_text()
+        figures[name] = metrics["all"]["dense"]
     assert record["light_fits"]["c1a"]["summary"].startswith("fitted on the map")
     assert len({(f["points"], f["rms_mm"]) for f in figures.values()}) == 3
     assert figures["near"]["points"] < figures["paper"]["points"]

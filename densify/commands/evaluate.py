@@ -69,5 +69,5 @@ def evaluate(
     with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite or output is None) as out:
         out.hash_inputs(truth=source.truth)
         answer = judge_asked(asked, first, out)
-        sources = Sources(run, source.truth, gap)
+        sources = Sources(run, source.truth, gap, "" if first is None else str(first))
         out.log(write_evaluations(answer.found, out.folder, answer.withheld, sources, asked.suite))
