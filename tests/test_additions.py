@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import fields, replace
 
-import pytest
 from colons import colon, sequence, slam, truth
 
 from densify.additions import additions, said
@@ -52,16 +51,17 @@ def test_opened_gates_and_reach_leave_no_keyframe_and_no_distance_out():
     assert reach[1] > reach[0]
 
 
-@pytest.mark.parametrize("recipe", ["paper", "full"])
-def test_report_log_and_record_say_what_was_added(recipe, tmp_path, capsys):
-    frames, config = colon(0).frames, replace(PAPER, recipe=recipe)
+def test_report_log_and_record_say_what_was_added(tmp_path, capsys):
+    frames = colon(0).frames
     found = slam(frames).map
-    work = Densified("truth", densify(sequence(frames), found, truth, config), Gallery(found), config=config)
-    with run_folder(tmp_path / "run", "densify", {}) as run:
-        work.write(run, ("ply",), None)
-    record = json.loads((tmp_path / "run" / "run.json").read_text())
-    told = any("--fusion.far" in note for note in work.notes("of", sequence(frames), None))
-    assert told is ("recipe" in record) is ("--fusion.far" in capsys.readouterr().out) is (recipe == "paper")
-    if recipe == "paper":
-        far = next(added for added in record["recipe"]["adds"] if added["setting"] == "fusion.far")
-        assert far["value"] == 2.0 and "2 times" in far["sentence"] and len(record["recipe"]["adds"]) == 8
+    results = densify(sequence(frames), found, truth, PAPER)
+    for recipe in ("paper", "full"):
+        work = Densified("truth", results, Gallery(found), config=replace(PAPER, recipe=recipe))
+        with run_folder(tmp_path / recipe, "densify", {}) as run:
+            work.write(run, ("ply",), None)
+        record = json.loads((tmp_path / recipe / "run.json").read_text())
+        told = any("--fusion.far" in note for note in work.notes("of", sequence(frames), None))
+        assert told is ("recipe" in record) is ("--fusion.far" in capsys.readouterr().out) is (recipe == "paper")
+        if recipe == "paper":
+            far = next(added for added in record["recipe"]["adds"] if added["setting"] == "fusion.far")
+            assert far["value"] == 2.0 and "2 times" in far["sentence"] and len(record["recipe"]["adds"]) == 8
