@@ -48,7 +48,7 @@ QUICK = {
     "train": "--trainer.max_steps 2 --trainer.val_check_interval 2 --data.tube.scenes 1 --data.tube.val_scenes 1 "
     "--data.tube.frames 4 --data.size [48,40]",
     "adapt": "--steps 2 --size [48,40] --held-out 0.4 --keep-worse",
-    "synth": "--frames 8 --size [64,52] --slam.maps 1 --slam.keyframe_every 1",
+    "synth": "--frames 8 --size [65,52] --slam.maps 1 --slam.keyframe_every 1",
 }
 
 

@@ -84,7 +84,8 @@ def run(
         checkpoints: Depth models to compare, each a row: path of a checkpoint, bundled name, decline (a formula from
             how light fades, no network) or constant (all equally far).
         recipes: Ways to make surfaces that are compared: full (all steps), paper (as published: one scale per keyframe,
-            plain TSDF), or both. Options of agreement, bending, contradiction and rectify count for full alone.
+            plain TSDF, and the gates and the reach that densify --recipe paper names), or both. Options of agreement,
+            bending, contradiction and rectify count for full alone.
         cases: Errors that map points share, each tried with one scale a keyframe and in full, by the last of
             --checkpoints: clean (none), side (30 % of the points, on one side, 15 % too far), wide side (45 %, 30 %),
             drift (of scale, 30 %), fold (20 % one fold too far), loop (half closed where there is none), poses (a bent

@@ -132,7 +132,7 @@ PAGES = {
             "lightdepth evaluate runs/dense --truth data/mine",
             "lightdepth evaluate runs/slam --truth data/mine -o runs/errors --thresholds-mm '[1, 3]'",
         ),
-        rare=("trajectory", "truth_mesh", "common"),
+        rare=("trajectory", "truth_mesh", "common", "join", "keep_mb", "bit_depth"),
     ),
     "bench": Page(
         (
