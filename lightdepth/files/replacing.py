@@ -124,7 +124,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     if not (isinstance(found, dict) and all(isinstance(found.get(name), kind) for name, kind in kinds.items())):
         return None
     whole = all(isinstance(found.get(name, {}), dict) for name in ("arguments", "inputs"))
-    return found if whole and all(isinstance(known, dict) for known in found.get("inputs", {}).values()) else None
+    return found if whole and all(isinstance(known, dict | str) for known in found.get("inputs", {}).values()) else None
 
 
 def listed(folder: Path) -> dict[str, int]:

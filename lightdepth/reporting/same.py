@@ -43,6 +43,8 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
             found = f"not resumed, --{name.replace('_', '-')} was {then.get(name)!r} and is {now.get(name)!r}"
             raise InputError(output, found, "give the same options, or --overwrite to start anew")
     for name, known in (begun.get("inputs") or {}).items():
+        if not isinstance(known, Mapping):
+            continue  # a training's: it has no more than their hashes
         path = Path(str(arguments.get(name) or known.get("path") or ""))
         if "sha256" in known and not (path.exists() and input_hash(path, output) == known["sha256"]):
             raise InputError(output, f"not resumed, {name} has changed since", "--overwrite starts anew")
