@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= runs/demo
 export OMP_WAIT_POLICY = passive
 
-.PHONY: setup demo test test-slow fuzz mutants kill coverage lint format bench same ablation clean
+.PHONY: setup demo test test-slow fuzz mutants kill soak offline coverage lint format bench same ablation ablation-paper clean
 
 setup: $(VENV)/.ready
 
@@ -50,6 +50,15 @@ mutants: setup
 kill: setup
 	$(BIN)/python tests/kill_matrix.py --seed $(or $(SEED),1) --only "$(ONLY)"
 
+# 2000 keyframes live and 200 sequences in one process, every tenth failing: what grows? About five minutes of one core.
+soak: setup
+	OMP_NUM_THREADS=1 $(BIN)/python tests/soak.py
+
+# The demo and the tests without network, home, name or a place to write packages: make offline WHAT="make demo"
+WHAT ?=
+offline: setup
+	bash tests/offline.sh $(WHAT)
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -70,6 +79,10 @@ same: setup
 # About an hour and a quarter on one core; what is already there is kept.
 ablation: setup
 	$(BIN)/lightdepth ablate --config configs/ablation/lightdepth.yaml -o runs/ablation --table docs/ablation.md
+
+# The same of the paper's preset: about two hours.
+ablation-paper: setup
+	$(BIN)/lightdepth ablate --config configs/ablation/paper.yaml -o runs/ablation-paper --table docs/ablation-paper.md
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
+from densify.additions import additions, said
 from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
 from densify.joining import MergeConfig, Merged, joined_name, merge
@@ -36,6 +37,8 @@ class Densified:
     merged: Merged | None = None
     doubts: tuple[str, ...] = ()
     """sentences on what the surfaces were made of, with which no verdict is green"""
+    config: DensifyConfig = field(default_factory=DensifyConfig)
+    """the settings that the surfaces were made with"""
 
     @classmethod
     def make(
@@ -67,7 +70,7 @@ class Densified:
             with Progress("Joining submaps", count) as bar:
                 join = partial(merge, results, frames, model, config, merging, lambda *_: bar.advance())
                 merged = join() if run is None else kept(run, "joined", Merged, join)
-        return cls(model.name, results, gallery, merged)
+        return cls(model.name, results, gallery, merged, config=config)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -101,6 +104,8 @@ class Densified:
         notes += [f"{of}; depth by {self.model}; light of the frames: {under}."]
         notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
         notes.append(f"Uncertainty: {self.of_uncertainty}.")
+        if self.config.recipe == "paper":
+            notes.append(f"{said(additions(self.config))}.")
         submaps = [result.dense.submap for result in self.results]
         weak = [str(s.id) for s in submaps if s.weak_visibility]
         if weak:
@@ -125,6 +130,7 @@ class Densified:
             run.log(f"verdict: {self.verdict}")
             run.record["verdict"] = plain(self.verdict)
         self._write_uncertainty(run)
+        note_recipe(run, self.config)
         records = []
         for result in self.results:
             dense, judgement = result.dense, result.judgement
@@ -201,3 +207,11 @@ class Densified:
             run.log(f"{text}{len(dense.aligned)} of {len(dense.alignments)} keyframes aligned")
         for map_id, reason in merged.meeting.alone().items():
             run.log(f"map {map_id} joins no other: {reason}")
+
+
+def note_recipe(run: Run, config: DensifyConfig) -> None:
+    """Says what the recipe adds to the paper, where it is the paper's, in log and run.json."""
+    if config.recipe == "paper":
+        added = additions(config)
+        run.log(said(added))
+        run.record["recipe"] = {"name": "paper", "adds": [{**plain(one), "sentence": str(one)} for one in added]}

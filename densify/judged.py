@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
+from densify.additions import additions, said
 from densify.config import DensifyConfig
 from densify.dense_map import map_folders
-from densify.densified import Densified
+from densify.densified import Densified, note_recipe
 from densify.evaluation.depth_files import DepthReading
 from densify.evaluation.judge import THRESHOLDS_MM, judge_maps
 from densify.evaluation.judge_depth import judge_depth
@@ -28,7 +29,7 @@ from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged
 from densify.evaluation.suite import Suite, present, read_suite
 from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.evaluation.truth import check_truth, read_truth
-from densify.inputs import MapSource, map_and_frames
+from densify.inputs import MapSource, fitted_light, map_and_frames
 from densify.judging.withheld import WithheldOfMap, withheld_errors
 from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
@@ -58,6 +59,9 @@ class TruthSource:
     mask: Path | None = None
     """Image, white where tissue shows and black elsewhere: only there is judged; left out, the truth folder's own mask,
     where it has one."""
+    light: str | None = None
+    """Light of the endoscope by which --checkpoint predicts: a light.json, a photometric XML, or values such as
+    gamma=2.2,mu=0. Left out, that of the truth's folder, else one fitted on each map (see --fit-light)."""
     bit_depth: Annotated[int | None, Range(8, 32)] = None
     """Bits of a sample in the truth's pictures that are stored in more than 8; left out, what the files say, else what
     their highest values show. A larger one reads the same numbers as darker."""
@@ -68,7 +72,7 @@ class TruthSource:
 
     def sequence(self, folder: Path) -> SequenceSource:
         """A folder of the truth: itself, or one of its sequences."""
-        return SequenceSource(folder, self.format, self.camera, mask=self.mask, bit_depth=self.bit_depth)
+        return SequenceSource(folder, self.format, self.camera, self.light, self.mask, self.bit_depth)
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,33 @@ class JudgingConfig(MapReading):
     def __post_init__(self) -> None:
         if not self.thresholds_mm:
             raise InputError("--thresholds-mm", f"{list(self.thresholds_mm)}", "expected distances in mm")
+
+
+@dataclass(frozen=True)
+class DenseFirst:
+    """How sparse maps are made dense before they are judged: as `densify` makes them."""
+
+    model: DepthModel
+    """what predicts"""
+    config: DensifyConfig = field(default_factory=DensifyConfig)
+    """recipe and settings"""
+    fit_light: bool = True
+    """whether the light is fitted on each map, where nobody gave it"""
+
+    def __str__(self) -> str:
+        light = "fitted on each map where nobody gave it" if self.fit_light else "as given, else assumed"
+        more = f". {said(additions(self.config))}" if self.config.recipe == "paper" else ""
+        return f"Sparse maps were made dense by {self.model.name}, recipe {self.config.recipe}, light {light}{more}"
+
+
+def check_used(checkpoint: str | None, source: TruthSource, config: DensifyConfig, fit_light: bool) -> None:
+    """Raises InputError where settings of what makes maps dense are given, and nothing makes them dense."""
+    if checkpoint is None and (config != DensifyConfig() or source.light is not None or not fit_light):
+        raise InputError(
+            "settings of densify, --light or --fit-light",
+            "given without --checkpoint: nothing is made dense",
+            "add --checkpoint NAME, or leave them out",
+        )
 
 
 @dataclass(frozen=True)
@@ -172,14 +203,16 @@ class Answer:
     """what the maps' withheld points say"""
 
 
-def judge_asked(asked: Asked, model: DepthModel | None, out: Run) -> Answer:
-    """All that was asked for; sparse maps are made dense with `model` first, and the surfaces written.
+def judge_asked(asked: Asked, first: DenseFirst | None, out: Run) -> Answer:
+    """All that was asked for; sparse maps are made dense `first`, where that is given, and the surfaces written.
 
     A sequence of a suite that cannot be judged is among the run's failures; InputError is raised when none can, and for
     a single sequence.
     """
     found: dict[str, Evaluation[DepthJudged | MapsJudged]] = {}
     withheld = [] if asked.suite else withheld_errors(asked.run)
+    if first is not None:
+        note_recipe(out, first.config)
     for name, reason in asked.missing.items():
         out.fail(name, reason)
     for name, (judged, folder) in asked.pairs.items():
@@ -189,7 +222,7 @@ def judge_asked(asked: Asked, model: DepthModel | None, out: Run) -> Answer:
                 check_truth(frames, asked.config.trust_truth)
                 found[name] = judge_depth(judged, frames, asked.config.max_depth_mm, asked.config.common, asked.reading)
                 continue
-            frames, maps, points = _maps(asked, name, model, out)
+            frames, maps, points = _maps(asked, name, first, out)
             withheld += [replace(entry, sequence=name) for entry in points] if asked.suite else points
             found[name] = _judged_maps(asked, judged, maps, frames)
         except InputError as error:
@@ -204,25 +237,32 @@ def judge_asked(asked: Asked, model: DepthModel | None, out: Run) -> Answer:
 
 
 def _maps(
-    asked: Asked, name: str, model: DepthModel | None, out: Run
+    asked: Asked, name: str, first: DenseFirst | None, out: Run
 ) -> tuple[FrameSequence, list[JudgedMap], list[WithheldOfMap]]:
     """The frames of a sequence, its maps, and what is said of their withheld points where it was not said before."""
     judged, folder = asked.pairs[name]
-    if model is None or map_folders(judged) or judged.is_file():
+    if first is None or map_folders(judged) or judged.is_file():
+        if first is not None:
+            out.log(f"{name}: taken as it is, dense or without points; --checkpoint and its settings change nothing")
         frames = asked.source.sequence(folder).open()
         reader = Reader(asked.config, stamps_of(folder, asked.source.format), frames[0].camera)
         maps = read_models(judged, asked.trajectory, reader)
         check_truth(frames, asked.config.trust_truth)
         return frames, maps, withheld_errors(judged) if asked.suite else []
     mapped = MapSource.read_as(judged, asked.config, asked.config.trust_map)
-    sparse_map, frames = map_and_frames(out, asked.source.sequence(folder), mapped, SfmConfig())
+    source = asked.source.sequence(folder)
+    sparse_map, frames = map_and_frames(out, source, mapped, SfmConfig())
+    known = source.open(sparse_map.submaps[0].keyframes[0].camera)  # those that are predicted from have no truth
+    check_truth(known, asked.config.trust_truth)
     if asked.suite:
         out.record.setdefault("pairings", {})[name] = out.record.pop("pairing")
-    check_truth(frames, asked.config.trust_truth)
-    maps, points = _made_dense(frames, sparse_map, model, out.folder / name if asked.suite else out.folder)
+    lit = fitted_light(out, frames, sparse_map, first.model, first.config, first.fit_light)
+    if asked.suite and "light_fit" in out.record:
+        out.record.setdefault("light_fits", {})[name] = out.record.pop("light_fit")
+    maps, points = _made_dense(lit, sparse_map, first, out.folder / name if asked.suite else out.folder)
     reader = Reader(asked.config, stamps_of(folder, asked.source.format))
     poses = asked.trajectory or (judged if trajectory_files(judged) else None)
-    return frames, with_trajectories(maps, read_trajectories(poses, reader)) if poses else maps, points
+    return known, with_trajectories(maps, read_trajectories(poses, reader)) if poses else maps, points
 
 
 def _judged_maps(
@@ -236,11 +276,11 @@ def _judged_maps(
 
 
 def _made_dense(
-    frames: FrameSequence, sparse_map: SparseMap, model: DepthModel, folder: Path
+    frames: FrameSequence, sparse_map: SparseMap, first: DenseFirst, folder: Path
 ) -> tuple[list[JudgedMap], list[WithheldOfMap]]:
-    """The maps made dense as `densify` makes them, with its defaults, and written; maps of which no surface was made
+    """The maps made dense as `densify` makes them, and written; maps of which no surface was made
     keep their sparse points. And what is said of the withheld points, with the constant distance's."""
-    work = Densified.make(frames, sparse_map, model, DensifyConfig())
+    work = Densified.make(frames, sparse_map, first.model, first.config)
     withheld = []
     for result in work.results:
         map_id = result.dense.submap.id

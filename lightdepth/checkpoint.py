@@ -26,6 +26,7 @@ from lightdepth.files.weights import MAX_HEADER, check_header, read_pickled
 from lightdepth.files.writing import write_whole
 from lightdepth.models import ConstantModel, DeclineModel, DepthModel, NetworkModel
 from lightdepth.network import DepthNetwork, NetworkConfig, build_network
+from lightdepth.reporting.names import told
 
 DEFAULT_CHECKPOINT = "lightdepth-synthetic"
 TRAINING_FREE: dict[str, type[DeclineModel] | type[ConstantModel]] = {
@@ -94,6 +95,15 @@ def load_model(name_or_path: str | Path = DEFAULT_CHECKPOINT, details: bool = Tr
     if path.suffix == ".ckpt":
         return _placed(_load_lightning(path, details))
     raise InputError(name, "unknown kind of checkpoint", "expected a name that ends in .safetensors or .ckpt")
+
+
+def load_called(name_or_path: str | Path, details: bool = True, option: str = "checkpoint") -> DepthModel:
+    """`load_model` for a verb: where the model's name is its path's and may tell a patient, its results are to call it
+    by the option and its contents, as they call all inputs. Raises InputError as `load_model` does."""
+    model = load_model(name_or_path, details)
+    if isinstance(model, NetworkModel):
+        model.name = told(model.name, **{option: name_or_path})
+    return model
 
 
 def from_pretrained(path_or_id: str | Path, details: bool = True, revision: str | None = None) -> DepthModel:
@@ -232,7 +242,8 @@ def _rows(found: dict[str, Any], path: Path) -> int:
 
 
 def _network(config: NetworkConfig, weights: dict[str, Tensor], path: Path) -> DepthNetwork:
-    network = build_network(config)
+    with torch.random.fork_rng(devices=[]):  # first weights are drawn, and go at once: a caller's own chance stays
+        network = build_network(config)
     weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
     if not all(torch.isfinite(value).all() for value in weights.values()):
         raise InputError(path, "weights are not all finite", "its training failed: take an earlier checkpoint")

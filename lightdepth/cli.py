@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 from lightdepth import __version__
 from lightdepth.command_line.own_packages import own_packages_first
-from lightdepth.command_line.pipes import outliving_readers
+from lightdepth.command_line.pipes import fill_closed_streams, outliving_readers
 from lightdepth.command_line.signals import ending_on_signals
 from lightdepth.command_line.warned import warnings_as_sentences
 from lightdepth.errors import (
@@ -65,18 +65,24 @@ ORDER = (
 def main(argv: list[str] | None = None) -> int:
     """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed, 5 the machine failed
     (disk, memory, a folder that is gone), 128 + n ended by signal n."""
+    fill_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show ends no run
-    given = sys.argv[1:] if argv is None else argv
+    given, code = sys.argv[1:] if argv is None else argv, 0
     try:
         with ending_on_signals(), outliving_readers(), warnings_as_sentences():
             # A run's own context: what one says of names does not hold for the next.
-            return copy_context().run(_main, given)
+            code = copy_context().run(_main, given)
+        return code
     except Interrupted as error:
         with suppress(OSError):  # the terminal may be what is gone
             print(f"lightdepth {given[0] if given else ''}: {error}", file=sys.stderr, flush=True)
         return 128 + error.signal
+    except MachineFailure as error:  # of the terminal itself: what was to be said could not be
+        with suppress(OSError):
+            print(f"lightdepth {given[0] if given else ''}: {error}", file=sys.stderr, flush=True)
+        return code or 5
 
 
 def _main(argv: list[str]) -> int:
@@ -100,6 +106,11 @@ def _main(argv: list[str]) -> int:
         hint = f"; did you mean {close[0]}?" if close else f"; expected one of {', '.join(_sorted(commands))}"
         print(f"lightdepth: no verb {verb!r}{hint}", file=sys.stderr)
         return 2
+    try:
+        os.getcwd()
+    except OSError:  # libraries of the verbs would crash on it
+        print(f"lightdepth {verb}: the folder that you are in is gone; go to another one", file=sys.stderr)
+        return 5
     try:
         function = commands[verb].load()
         if list(inspect.signature(function).parameters) == ["argv"]:

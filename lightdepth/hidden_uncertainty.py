@@ -173,17 +173,17 @@ class _File(BaseModel):
     factor: float
 
 
-def read_factor(path: Path, checkpoint: str) -> float:
-    """The factor on a checkpoint's uncertainty that a run folder, or its uncertainty.json, says. Raises InputError
-    where there is none, or it is another checkpoint's."""
+def read_factor(path: Path, *names: str) -> float:
+    """The factor on the uncertainty of a checkpoint, by any of its names, that a run folder, or its uncertainty.json,
+    says. Raises InputError where there is none, or it is another checkpoint's."""
     file = path / FILE if path.is_dir() else path
     if path.is_dir() and not file.is_file():
         raise InputError(
             path, "no uncertainty.json in it", "expected a `densify` run whose log says that uncertainty is calibrated"
         )
     found = checked_fields(_File, read_json(file), str(file))
-    if found.checkpoint != checkpoint:
-        raise InputError(file, f"it is of the checkpoint {found.checkpoint}", f"expected one of {checkpoint}")
+    if found.checkpoint not in names:
+        raise InputError(file, f"it is of the checkpoint {found.checkpoint}", f"expected one of {names[0]}")
     if not (np.isfinite(found.factor) and found.factor > 0):
         raise InputError(file, f"factor: {found.factor}", "expected a positive number")
     return found.factor

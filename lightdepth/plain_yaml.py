@@ -45,6 +45,13 @@ class Loader(yaml.SafeLoader):
             self._held[anchor] = self._nodes - before
         return node
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        try:
+            return super().construct_object(node, deep)
+        except (AttributeError, LookupError, TypeError) as error:  # `!!bool x`, `!!timestamp x`
+            problem = f"is no {node.tag.rpartition(':')[2]}"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from error
+
     def _count(self, more: int) -> None:
         self._nodes += more
         if self._nodes > MAX_NODES:

@@ -33,6 +33,9 @@ HERE = Path(__file__).resolve().parent
 CORPUS = HERE / "corpus"
 SECONDS_AN_INPUT = 5
 MOST_BYTES = 1 << 30
+_OWN_MB = 256
+"""What the inputs that are kept to build on may take in a process, which is then ended, and another goes on."""
+_FULL = 3
 _NUMBERS = (
     *(b"nan", b"inf", b"-inf", b"1e308", b"-1e308", b"1e-300", b"0", b"-0", b"-1", b"1", b"1e5", b"1e13", b"65536"),
     *(b"2147483648", b"9223372036854775808", b"99999999999999999999", b"1" + b"0" * 30, b"0.5", b"1_0", b"0x10"),
@@ -270,8 +273,14 @@ class Fuzzing:
         return refused
 
 
-def _resident() -> float:
+def _peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _resident() -> float:
+    """Megabytes now; 0 where the system does not say."""
+    status = Path("/proc/self/statm")
+    return int(status.read_text().split()[1]) * resource.getpagesize() / 2**20 if status.is_file() else 0.0
 
 
 def child(parser: Any, seconds: float, seed: int, folder: Path, guided: Any) -> None:
@@ -284,11 +293,11 @@ def child(parser: Any, seconds: float, seed: int, folder: Path, guided: Any) -> 
     if status.is_file():
         pages = int(status.read_text().split()[0])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MOST_BYTES, resource.RLIM_INFINITY))
-    before, began, said = _resident(), time.process_time(), 0.0
+    before, peak, began, said = _resident(), _peak(), time.process_time(), 0.0
 
     def note() -> None:
         fuzzing.found.seconds = time.process_time() - began
-        fuzzing.found.peak_mb = max(0.0, _resident() - before)
+        fuzzing.found.peak_mb = max(0.0, _peak() - peak)
         (folder / "found.json").write_text(json.dumps(asdict(fuzzing.found)))
 
     def one(data: bytes) -> None:
@@ -299,6 +308,8 @@ def child(parser: Any, seconds: float, seed: int, folder: Path, guided: Any) -> 
         if now > said + 1 or now > seconds:
             said = now
             note()
+            if _resident() - before > _OWN_MB:
+                os._exit(_FULL)
         if now > seconds:
             os._exit(0)
 
@@ -336,7 +347,7 @@ def run(parser: Any, seconds: float, seed: int, guided: Any) -> Found:
             if process == 0:
                 child(parser, left, seed, folder, guided)
                 os._exit(0)
-            died = _waited_for(process, folder)
+            died, full = _waited_for(process, folder)
             found = Found(parser.name)
             if (folder / "found.json").is_file():
                 found = Found(**json.loads((folder / "found.json").read_text()))
@@ -347,23 +358,25 @@ def run(parser: Any, seconds: float, seed: int, guided: Any) -> Found:
             total.inputs, total.refused = total.inputs + found.inputs, total.refused + found.refused
             total.seconds, total.peak_mb = total.seconds + found.seconds, max(total.peak_mb, found.peak_mb)
             total.findings |= found.findings
-            left -= max(found.seconds, 5) if died else left
+            left -= max(found.seconds, 5) if died or full else left
             seed += 1
     return total
 
 
-def _waited_for(process: int, folder: Path) -> str:
-    """How the process ended, "" where as it should. One whose input takes a minute is stuck in a library."""
+def _waited_for(process: int, folder: Path) -> tuple[str, bool]:
+    """How the process ended, "" where as it should, and whether it was full of what it keeps. One whose input takes a
+    minute is stuck in a library."""
     began, current = time.monotonic(), folder / "current"
     while True:
         ended, status = os.waitpid(process, os.WNOHANG)
         if ended:
-            return "" if status == 0 else f"the process ended with {os.waitstatus_to_exitcode(status)}"
+            code = os.waitstatus_to_exitcode(status)
+            return "" if code in (0, _FULL) else f"the process ended with {code}", code == _FULL
         since = max(began, current.stat().st_mtime - time.time() + time.monotonic() if current.is_file() else began)
         if time.monotonic() - since > 60:
             os.kill(process, signal.SIGKILL)
             os.waitpid(process, 0)
-            return "it hung in a library"
+            return "it hung in a library", False
         time.sleep(0.2)
 
 

@@ -27,11 +27,26 @@ from killing import Case, Stage, Verb, drawn, run  # noqa: E402 - the threads of
 
 ON_MAP = ("--map", "synth/slam", "--checkpoint", "decline")
 VERBS = (
-    Verb("synth", ("synth", "-o", "out", "--frames", "4", "--size", "[48, 40]"), "out", ("--seed", "9")),
+    Verb(
+        "synth",
+        ("synth", "-o", "out", "--frames", "6", "--size", "[48, 40]", "--slam.keyframe-every", "1"),
+        "out",
+        ("--seed", "9"),
+    ),
     Verb("import", ("import", "synth", "-o", "out", "--every", "2"), "out", ("--every", "3"), resumes=True),
-    Verb("calibrate-light", ("calibrate-light", "synth", "-o", "out/light.json", *ON_MAP[:2]), "out", overwrites=False),
-    Verb("convert-camera", ("convert-camera", "synth/camera.json", "-o", "out/camera.xml"), "out", overwrites=False),
-    Verb("select", ("select", "wide", "-o", "out/list.txt"), "out", overwrites=False),
+    Verb(
+        "calibrate-light",
+        ("calibrate-light", "synth", "-o", "out/light.json", *ON_MAP[:2]),
+        "out",
+        ("--seed", "5"),
+    ),
+    Verb(
+        "convert-camera",
+        ("convert-camera", "synth/camera.json", "-o", "out/camera.xml"),
+        "out",
+        ("--size", "[192, 160]"),
+    ),
+    Verb("select", ("select", "wide", "-o", "out/list.txt"), "out", ("--sift.ratio", "0.7")),
     Verb(
         "train", ("train", "--config", "train.yaml", "-o", "out"), "out", ("--seed", "5"), resumes=True, in_place=True
     ),
@@ -72,15 +87,27 @@ VERBS = (
     ),
     Verb(
         "measure",
-        ("measure", "dense", "-o", "out/lengths.json", "--map", "0", "--points", "[[0, 0, 30], [4, 2, 31]]"),
+        (
+            "measure",
+            "dense",
+            "-o",
+            "out/lengths.json",
+            "--map",
+            "0",
+            "--frame",
+            "2",
+            "--pixels",
+            "[[30, 30], [55, 45]]",
+        ),
         "out",
-        overwrites=False,
+        ("--pixels", "[[30, 30], [50, 50]]"),
+        again=(),
     ),
     Verb("export", ("export", "dense", "-o", "out", "--to", "ply"), "out", ("--to", "obj")),
     Verb("demo", ("demo", "-o", "out", "--frames", "8", "--size", "[96, 80]"), "out", ("--seed", "9")),
 )
-QUICK = ("predict", "export", "train")
-"""Those of which `make test` kills a few."""
+QUICK = ("import", "convert-camera", "predict")
+"""Those of which `make test` kills a few: a single file, and two folders that are made in parts."""
 TRAIN = """data: {sequences: [synth], size: [80, 64], batch_size: 2, tube: {scenes: 0, val_scenes: 0}}
 trainer: {max_steps: 6, accelerator: cpu, log_every_n_steps: 2, val_check_interval: 2}
 """
@@ -98,31 +125,50 @@ MADE = (
 )
 
 
-def import_all() -> None:
+def import_all(quick: bool = False) -> None:
     """What a child would import first, which takes longer than its work. No library gets a thread to work in yet."""
     import importlib
 
     import torch
 
     torch.set_num_threads(1)
-    for name in ("train.commands.adapt", "train.commands.train", "densify.commands.bench", "densify.commands.demo"):
+    modules = [f"lightdepth.commands.{name}" for name in ("import_frames", "predict", "synth")] + ["lightdepth.cli"]
+    if not quick:
+        modules += [f"train.commands.{name}" for name in ("adapt", "train")]
+        modules += [f"densify.commands.{name}" for name in ("bench", "demo", "densify", "live")]
+    for name in modules:
         importlib.import_module(name)
-    for name in ("densify.commands.densify", "densify.commands.live", "lightdepth.cli"):
-        importlib.import_module(name)
-    from lightdepth import native
+    import PIL.Image
+    from matplotlib.backends import backend_agg  # noqa: F401 - the import is what is wanted
 
-    native.pycolmap()
-    native.open3d()
+    PIL.Image.init()
+    if not quick:
+        from lightdepth import native
+
+        native.pycolmap()
+        native.open3d()
 
 
-def inputs(home: Path, needed: tuple[str, ...] = ("synth", "wide", "predict", "dense")) -> Path:
+def few_inputs(home: Path) -> Path:
+    """As `inputs`, for the quick verbs, without anything that takes time to render."""
+    from scenes import cylinder
+
+    from lightdepth.camera import Pinhole
+    from lightdepth.datasets import write_folder
+
+    scene = cylinder(Pinhole(48, 40, 26.0, 26.0, 23.0, 21.0))
+    write_folder([scene.frame(f"{i:04d}") for i in range(8)], home / "inputs" / "synth")
+    return home / "inputs"
+
+
+def inputs(home: Path) -> Path:
     """The folder of inputs that the verbs find, made once."""
     folder = home / "inputs"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "train.yaml").write_text(TRAIN, encoding="utf-8")
     (folder / "ablate.yaml").write_text(ABLATE, encoding="utf-8")
     for name, argv in MADE:
-        if name in needed and not (folder / name).exists():
+        if not (folder / name).exists():
             ended, _ = run(list(argv), folder)
             assert ended.code == 0, ended.said
     return folder
@@ -140,18 +186,38 @@ def cases(stage: Stage, verb: Verb, seed: int, count: int) -> list[Case]:
     return found
 
 
+def few_cases(stage: Stage, verb: Verb, seed: int) -> list[Case]:
+    """Four: at a rename into place and in a file, with an older result and without, by either kind of signal."""
+    rng, found = random.Random(f"{seed} {verb.name}"), []
+    soft = rng.choice([signal.SIGTERM, signal.SIGINT])
+    for over in (False, True):
+        events = stage.events(verb, over)
+        renames = [i for i, event in enumerate(events) if event.places(verb.output)] or [len(events) - 1]
+        others = [i for i, event in enumerate(events) if event.kind == "opened"]
+        in_place = [i for i in others if events[i].paths[0].startswith(f"{verb.output}/")]
+        others = in_place or others  # the place of the result is where a file that is not whole would be seen
+        for at, number in zip(
+            (rng.choice(renames), rng.choice(others)),
+            (soft, signal.SIGKILL) if over else (signal.SIGKILL, soft),
+            strict=True,
+        ):
+            found.append(Case(verb, at, number, over))
+    return found
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--events", type=int, default=12, help="of each verb, for each kind of signal")
     parser.add_argument("--only", default="", help="verbs, comma between them")
     parser.add_argument("--into", type=Path, default=Path("runs/kill"))
+    parser.add_argument("--quick", action="store_true", help="four cases of three verbs that take little time")
     given = parser.parse_args()
-    only = [name for name in given.only.split(",") if name]
+    only = [*QUICK] if given.quick else [name for name in given.only.split(",") if name]
     if unknown := set(only) - {verb.name for verb in VERBS}:
         parser.error(f"--only {', '.join(sorted(unknown))}; expected some of {', '.join(verb.name for verb in VERBS)}")
-    import_all()
-    stage = Stage(given.into, inputs(given.into.resolve()))
+    import_all(given.quick)
+    stage = Stage(given.into, (few_inputs if given.quick else inputs)(given.into.resolve()))
     notes = given.into / f"{given.seed}.jsonl"
     played = {}
     if notes.is_file():
@@ -164,7 +230,7 @@ def main() -> int:
             continue
         start = time.monotonic()
         try:
-            todo = cases(stage, verb, given.seed, given.events)
+            todo = few_cases(stage, verb, given.seed) if given.quick else cases(stage, verb, given.seed, given.events)
         except AssertionError as error:
             print(f"{verb.name}: cannot be played: {error}", flush=True)
             broken += 1

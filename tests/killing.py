@@ -2,14 +2,17 @@
 
 A verb runs in a forked child whose audit hook counts what it does to files below its own folder: opening to write,
 renaming, removing, making and removing folders. At a drawn event the child sends itself a signal, just before the event
-happens; so a kill at a rename leaves what was there before it, and one at the event after it what the rename made.
+happens; so a kill at a rename leaves what was there before it, and one at the event after it what the rename made. That
+a file was opened is an event of its own, behind it: the file is there then and nothing is in it yet.
 Times would not do: a run spends most of its own in the import of libraries.
 """
 
 from __future__ import annotations
 
+import builtins
 import contextlib
 import hashlib
+import io
 import json
 import os
 import shutil
@@ -19,6 +22,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from same_results import difference, files
 
@@ -52,6 +56,8 @@ class Verb:
     older: tuple[str, ...] = ()
     """Options that make another result, which a run with --overwrite finds."""
     overwrites: bool = True
+    again: tuple[str, ...] = ("--overwrite",)
+    """Options with which a run replaces an older result."""
     resumes: bool = False
     in_place: bool = False
     """Whether the work is done in the output itself, which is complete when run.json is there."""
@@ -143,7 +149,7 @@ def _count(folder: Path, notes: int, at: int | None, number: int) -> None:
         if kind == "open":
             path, _, flags = given
             paths = [below(path)] if isinstance(flags, int) and flags & WRITING else []
-        elif kind in CHANGING:
+        elif kind in (*CHANGING, "opened"):
             paths = [below(path) for path in given[:2]]
         else:
             return
@@ -155,6 +161,14 @@ def _count(folder: Path, notes: int, at: int | None, number: int) -> None:
         if seen - 1 == at:  # counted before: the signal may end this function by an exception
             os.kill(own, number)
 
+    def opened(file: Any, mode: str = "r", *given: Any, **named: Any) -> Any:
+        made = real(file, mode, *given, **named)
+        if set(mode) & set("wax+"):
+            heard("opened", (file,))
+        return made
+
+    real = io.open
+    builtins.open = io.open = opened
     sys.addaudithook(heard)
 
 
@@ -226,7 +240,7 @@ class Stage:
         if key not in self._references:
             folder = self._folder(f"{verb.name.replace(' ', '_')}-over")
             shutil.copytree(self.reference(verb, True)[0] / verb.output, folder / verb.output)
-            ended, events = run([*verb.argv, "--overwrite"], folder)
+            ended, events = run([*verb.argv, *verb.again], folder)
             assert ended.code == 0, f"{verb.name} --overwrite ends with {ended.code}:\n{ended.said}"
             found = unlike(folder / verb.output, self.reference(verb, False)[0] / verb.output)
             assert not found, f"{verb.name} --overwrite makes another result: {found}"
@@ -246,15 +260,16 @@ class Stage:
         older = self.reference(verb, True)[0] / verb.output if case.over else None
         if older is not None:
             shutil.copytree(older, folder / verb.output)
-        again = ["--overwrite"] if case.over else []
+        again = verb.again if case.over else ()
         ended, _ = run([*verb.argv, *again], folder, case.at, case.number)
         wrong = [*_after_the_signal(case, folder, reference / verb.output, older, ended)]
         wrong += self._inputs_changed(folder, verb)
-        resumes = ["--resume"] if verb.resumes else []
-        if not verb.resumes and verb.overwrites and (folder / verb.output).exists():
-            resumes = ["--overwrite"]
-        if case.over and older is not None and _holds(folder / verb.output, older):
-            resumes = ["--overwrite"]
+        resumes = ("--resume",) if verb.resumes else ()
+        there = (folder / verb.output).exists() or _successor(folder, verb)  # it takes its place before all else
+        if not verb.resumes and verb.overwrites and there:
+            resumes = verb.again
+        if case.over and older is not None and not _goes_on(folder, verb) and _old_one(folder, verb, older):
+            resumes = verb.again
         restarted, _ = run([*verb.argv, *resumes], folder)
         if restarted.code:
             wrong.append(
@@ -309,10 +324,34 @@ def _after_the_signal(case: Case, folder: Path, made: Path, older: Path | None, 
         beside = [output, *(path for path in folder.iterdir() if path.name.startswith("."))]
         if not any(_holds(path, older) for path in beside) and (older / "run.json").is_file():
             yield "the old result is nowhere whole"
-    if number != signal.SIGKILL and not verb.resumes and ended.code:
-        names = {path.name for path in folder.iterdir() if path.name.startswith(".")}
-        for name in sorted(names):
+    if number != signal.SIGKILL and ended.code:
+        if older is not None and not _holds(output, older) and not _holds(output, made):
+            yield f"{verb.output} is not as it was after {number.name}"
+        if older is None and tried:
+            yield f"{verb.output} is left empty after {number.name}"
+        kept = {f".{verb.output}.unfinished"} if _goes_on(folder, verb) else set()
+        for name in sorted({path.name for path in folder.iterdir() if path.name.startswith(".")} - kept):
             yield f"{name} is left after {number.name}"
+
+
+def _goes_on(folder: Path, verb: Verb) -> bool:
+    """Whether a hidden run with a finished part or a checkpoint is there, which --resume has to go on with."""
+    made = folder / f".{verb.output}.unfinished"
+    parts = made / "parts.jsonl"
+    return (parts.is_file() and b"\n" in parts.read_bytes()) or any(made.glob("checkpoints/[!.]*.ckpt"))
+
+
+def _old_one(folder: Path, verb: Verb, older: Path) -> bool:
+    """Whether the older result is still the one, in its place or moved aside with no whole successor."""
+    if _holds(folder / verb.output, older):
+        return True
+    aside = not (folder / verb.output).exists() and _holds(folder / f".{verb.output}.old", older)
+    return aside and not _successor(folder, verb)
+
+
+def _successor(folder: Path, verb: Verb) -> bool:
+    """Whether a result is whole and had only to take its place."""
+    return (folder / f".{verb.output}.unfinished" / "run.json").is_file()
 
 
 def _holds(folder: Path, result: Path) -> bool:
@@ -324,9 +363,12 @@ def _strays(folder: Path, reference: Path) -> list[str]:
 
 
 def drawn(verb: Verb, events: list[Event], count: int, draw: Callable[[int], list[int]]) -> list[int]:
-    """Which events a verb is killed at: those around a rename into place, and others that `draw` orders by chance."""
+    """Which events a verb is killed at: all around a rename into place, and others that `draw` orders by chance, at
+    least a third of `count`. Where less than twelve are asked for, those around renames are drawn as well."""
     around = [i for i, event in enumerate(events) if event.places(verb.output)]
     around = sorted({i for at in around for i in (at, at + 1) if i < len(events)})
-    others = [i for i in draw(len(events)) if i not in around]
-    half = around if len(around) <= count // 2 else around[:2] + around[-(count // 2 - 2) :]
-    return sorted([*half, *others[: count - len(half)]])
+    order = draw(len(events))
+    others = [i for i in order if i not in around]
+    if count < 12:
+        around = [i for i in order if i in around][: count // 2]
+    return sorted([*around, *others[: max(count - len(around), count // 3)]])

@@ -247,6 +247,8 @@ MORE = [
     Command(f"bench estimators {OUT} --points [3]", words="--points"),
     Command(f"bench estimators {OUT} --draws 0", words="--draws: 0"),
     Command(f"bench estimators {OUT} --shares [1.5]", words="--shares"),
+    Command(f"bench per-frame {OUT} --checkpoints HERE/nowhere", words="nowhere"),
+    Command(f"bench per-frame {OUT} --checkpoints [] --colons HERE/nowhere", words="nowhere"),
     # ---- places for the output
     Command(f"predict {DATA} {DECLINE} -o HERE/file", words="file"),
     Command(f"predict {DATA} {DECLINE} -o HERE/others", words="others"),

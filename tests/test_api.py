@@ -18,7 +18,7 @@ PACKAGES = ("lightdepth", "densify")
 
 
 def test_the_page_does_what_it_says(tmp_path, monkeypatch):
-    frames = colon(0, 12).frames
+    frames = colon(0, 8).frames
     write_synthetic(frames, slam(frames), tmp_path / "data")
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
@@ -48,7 +48,7 @@ def test_the_names_for_type_checkers_are_those_that_are_there():
 
 
 def test_what_is_shown_of_frames_maps_and_results_fits_on_a_few_lines():
-    frames = colon(0, 12).frames
+    frames = colon(0, 8).frames
     found = slam(frames)
     for shown in (frames[0], found.map, found.map.submaps[0], found.map.submaps[0].keyframes[0]):
         assert len(repr(shown)) < 600, repr(shown)

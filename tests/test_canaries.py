@@ -167,6 +167,18 @@ def test_yaml_that_stands_for_more_than_it_is_is_refused_wherever_it_is_read(cas
     assert "Traceback" not in said and len(said) < 3000
 
 
+@pytest.mark.parametrize("value", ["!!bool x", "!!timestamp x", "!!int x", "!!binary é", "!!pairs 1", "2001-99-99"])
+def test_yaml_that_says_another_kind_than_it_is_is_refused_wherever_it_is_read(value, tmp_path, capsys):
+    with pytest.raises(yaml.YAMLError):
+        plain_yaml.load(f"a: {value}")
+    (tmp_path / "c.yaml").write_text(f"seed: {value}\n", encoding="utf-8")
+    for verb in ("synth", "predict"):
+        with pytest.raises(SystemExit) as ended:
+            main([verb, "-o", str(tmp_path / "run"), "--config", str(tmp_path / "c.yaml")])
+        assert ended.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
 def test_a_value_on_the_command_line_is_bounded_as_a_file_is(capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["densify", "D", "-o", "O", "--merging", BOMB])

@@ -39,6 +39,14 @@ def test_a_saved_network_comes_back_with_its_configuration_card_and_weights(tmp_
     assert all(torch.equal(value, model.network.state_dict()[name]) for name, value in network.state_dict().items())
 
 
+def test_loading_a_network_leaves_a_caller_s_own_chance_alone():
+    torch.manual_seed(3)
+    expected = torch.rand(2)
+    torch.manual_seed(3)
+    load_model(DEFAULT_CHECKPOINT)
+    assert torch.equal(torch.rand(2), expected)
+
+
 def test_half_precision_halves_the_file_and_rounds_by_a_thousandth(tmp_path):
     network = build_network(NetworkConfig())
     for half in (True, False):

@@ -414,7 +414,7 @@ def gradcheck_inputs():
         replace(PAPER, photometric=1.0, space="linear", huber=0.05),
         replace(PAPER, photometric=0.0, ssim=1.0),
         replace(PAPER, photometric=0.0, facing=1.0, cosine_floor=0.9),
-        replace(PAPER, photometric=0.0, specular=1.0, white=0.5),
+        replace(PAPER, photometric=0.0, specular=1.0, white=0.5, highlight_size=1.0, highlight_contrast=0.0),
         replace(PAPER, photometric=0.0, saturated=1.0, white=0.5),
         replace(PAPER, photometric=0.0, supervised=1.0),
         replace(LAMBERT, smoothness=0.0, chroma=0.0, ambient=0.3, shoulder=0.5),

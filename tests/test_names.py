@@ -22,7 +22,7 @@ from lightdepth.reporting.run import run_folder
 CANARY = "MUSTERMANN_Erika_1957"
 
 
-def telling(folder: Path) -> list[str]:
+def telling(folder: Path, canary: str = CANARY) -> list[str]:
     """Files below a folder, but inputs.json, in whose bytes or whose packed members the canary stands."""
     found = []
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != INPUTS):
@@ -30,7 +30,7 @@ def telling(folder: Path) -> list[str]:
         if zipfile.is_zipfile(io.BytesIO(contents)):
             with zipfile.ZipFile(path) as packed:
                 contents += b"".join(packed.read(name) for name in packed.namelist())
-        if CANARY.lower().encode() in contents.lower():
+        if any(canary.lower().encode(code) in contents.lower() for code in ("utf-8", "utf-16-le", "utf-32-le")):
             found.append(str(path.relative_to(folder)))
     return found
 

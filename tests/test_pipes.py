@@ -35,6 +35,32 @@ def test_a_run_stands_when_nobody_reads_what_it_says(data, tmp_path, monkeypatch
     assert len(list((tmp_path / "run").rglob("*.npz"))) == 8 and not list(tmp_path.glob(".run-*"))
 
 
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_run_stands_where_what_it_says_finds_no_room_and_the_end_says_so(data, tmp_path, monkeypatch, stream):
+    with open("/dev/full", "w", buffering=1) as full:
+        monkeypatch.setattr(sys, stream, full)
+        code = lightdepth("predict", data, "--checkpoint", "decline", "-o", tmp_path / "run", "--resume")
+        monkeypatch.undo()
+    assert code == 5 and (tmp_path / "run" / "run.json").is_file()
+    assert len(list((tmp_path / "run").rglob("*.npz"))) == 8
+
+
+@pytest.mark.parametrize(("closed", "code"), [("", 0), ("nothing", 2)])
+def test_a_program_without_a_terminal_at_all_ends_as_it_would_with_one(closed, code):
+    streams = "<&- >&- 2>&-" if closed else ">&-"
+    words = f'"{sys.executable}" -m lightdepth {closed or "--help"} {streams}'
+    done = subprocess.run(["sh", "-c", words], stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
+def test_in_a_folder_that_is_gone_a_verb_says_so(tmp_path, monkeypatch, capsys):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert lightdepth("synth", "-o", "x") == 5
+    assert "the folder that you are in is gone" in capsys.readouterr().err
+
+
 def test_a_warning_is_one_sentence_without_a_place_in_the_code(tmp_path):
     (tmp_path / "k.yaml").write_text("{image_width: 640, image_height: 480, K: [0.9, 1.1, 0.5, 0.5], D: [0, 0, 0, 0]}")
     argv = [sys.executable, "-m", "lightdepth", "convert-camera", "k.yaml", "-o", "camera.json"]

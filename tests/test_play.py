@@ -141,7 +141,6 @@ def test_the_verb_names_lost_frames_and_refuses_settings_that_are_none(data, tmp
     for setting_, message in (
         ({"rate": -1.0}, "--rate … -1"),
         ({"budget_ms": 0.0}, "--budget-ms … 0"),
-        ({"mm_per_unit": 0.0}, "--mm-per"),
     ):
         with refused(message):
             live(data, tmp_path / "x", map=data / "slam", checkpoint="decline", **setting_)

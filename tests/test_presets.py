@@ -62,7 +62,7 @@ def test_a_config_counts_more_than_a_preset_and_an_option_more_than_both_in_any_
 def test_an_unknown_preset_is_one_line_with_the_nearest_name():
     with pytest.raises(Wrong, match=r"^--preset papr: no such preset of train; is paper meant\?$"):
         with_preset("train", ["--preset", "papr"], refuse)
-    with pytest.raises(Wrong, match="expected one of c3vd, endomapper"):
+    with pytest.raises(Wrong, match="expected one of both, c3vd, endomapper"):
         with_preset("train", ["--preset=?"], refuse)
     with pytest.raises(Wrong, match="--config takes a file"):
         with_preset("train", ["--preset", "configs/train/paper.yaml"], refuse)

@@ -48,7 +48,7 @@ QUICK = {
     "train": "--trainer.max_steps 2 --trainer.val_check_interval 2 --data.tube.scenes 1 --data.tube.val_scenes 1 "
     "--data.tube.frames 4 --data.size [48,40]",
     "adapt": "--steps 2 --size [48,40] --held-out 0.4 --keep-worse",
-    "synth": "--frames 8 --size [64,52] --slam.maps 1 --slam.keyframe_every 1",
+    "synth": "--frames 8 --size [65,52] --slam.maps 1 --slam.keyframe_every 1",
 }
 
 
@@ -75,8 +75,10 @@ def test_every_command_of_the_readme_is_understood(command):
         else:
             from densify.commands import bench
 
-            name = words.pop(0) if words[0] in ("compare", "estimators") else ""
-            function = {"compare": bench.compare_runs, "estimators": bench.compare_estimators}.get(name, bench.run)
+            ways = {"compare": bench.compare_runs, "estimators": bench.compare_estimators}
+            ways["per-frame"] = bench.compare_per_frame
+            name = words.pop(0) if words[0] in ways else ""
+            function = ways.get(name, bench.run)
             parser = verb_parser(function, f"bench {name}".strip())
     else:
         parser = verb_parser(entry.load(), verb)
@@ -84,7 +86,7 @@ def test_every_command_of_the_readme_is_understood(command):
 
 
 def test_the_commands_that_take_seconds_run_as_they_stand(tmp_path, monkeypatch):
-    frames = colon(0, 12).frames
+    frames = colon(0, 8).frames
     write_synthetic(frames, slam(frames), tmp_path / "data")
     write_folder(colon(1, 4).frames, tmp_path / "others")
     camera = frames[0].camera

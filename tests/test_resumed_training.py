@@ -22,7 +22,7 @@ import train.fit as fit_module
 from lightdepth.checkpoint import read_card
 from lightdepth.command_line.signals import ending_on_signals
 from lightdepth.errors import Interrupted
-from train.checkpoints import WholeCheckpoints, newest
+from train.checkpoints import WholeCheckpoints, clear_cut_off, newest
 from train.commands.train import train
 from train.requeue import requeued
 
@@ -185,6 +185,25 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_that_was_there(tmp_p
         writer.save_checkpoint({"step": lambda: 2}, path)
     assert torch.load(path, weights_only=True) == {"step": 1}
     assert {p.name for p in tmp_path.iterdir()} <= {"last.ckpt", "last-previous.ckpt"}
+
+
+def test_what_a_kill_left_beside_checkpoints_goes(tmp_path, monkeypatch):
+    writer, last, real = WholeCheckpoints(), tmp_path / "last.ckpt", os.replace
+    writer.save_checkpoint({"step": 1}, last)
+
+    def killed_at_the_last(made, path):
+        if path == last:
+            raise KeyboardInterrupt
+        real(made, path)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(os, "replace", killed_at_the_last)
+        writer.save_checkpoint({"step": 2}, last)
+    writer.save_checkpoint({"step": 3}, last)  # last and last-previous are one file until now
+    assert {p.name for p in tmp_path.iterdir()} == {"last.ckpt", "last-previous.ckpt"}
+    os.link(last, tmp_path / ".last-previous.ckpt")
+    clear_cut_off(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == {"last.ckpt", "last-previous.ckpt"}
 
 
 def test_overwriting_leaves_the_old_result_whole_until_the_new_one_is(sequence, tmp_path):

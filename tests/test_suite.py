@@ -16,6 +16,8 @@ from verbs import by_options
 
 from densify.commands.evaluate import evaluate as evaluate_verb
 from densify.evaluation.suite import present, read_suite
+from densify.fusion.volume import FusionConfig
+from densify.judging.config import JudgeConfig
 from lightdepth.datasets import write_c3vd
 from lightdepth.datasets.c3vd import C3VD
 from lightdepth.datasets.splits import read_split
@@ -103,6 +105,39 @@ def test_runs_made_before_are_taken_as_they_are(trees, tmp_path):
         evaluate(tmp_path / "runs", data, tmp_path / "out", suite=SUITE)
     found = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert list(found["all"]) == ["sparse"]  # one sequence: its figures are the file's
+
+
+def one_sequence(trees: tuple[Path, Path], folder: Path) -> Path:
+    """The maps of one sequence of the suite alone."""
+    shutil.copytree(trees[1] / "cecum_t1_a", folder / "cecum_t1_a")
+    return folder
+
+
+def test_a_suite_takes_recipe_settings_and_light_as_densify_does(trees, tmp_path):
+    maps = one_sequence(trees, tmp_path / "maps")
+    given = {"suite": SUITE, "checkpoint": "decline", "judge": JudgeConfig(on=False)}
+    figures = {}
+    for name, more in {
+        "near": {"recipe": "paper", "light": "gamma=1.2,mu=0", "fusion": FusionConfig(far=1.0)},
+        "fitted": {"recipe": "full"},
+    }.items():
+        with pytest.raises(PartialFailure, match=r"11 part\(s\) failed"):
+            evaluate(maps, trees[0], tmp_path / name, **given, **more)
+        record = json.loads((tmp_path / name / "run.json").read_text())
+        assert ("light_fits" in record) is (name == "fitted") and ("recipe" in record) is (name != "fitted")
+        metrics = json.loads((tmp_path / name / "metrics.json").read_text())
+        assert f"by decline, recipe {more['recipe']}" in metrics["made_dense"]
+        assert metrics["made_dense"] in (tmp_path / name / "metrics.md").read_text()
+        figures[name] = metrics["all"]["dense"]
+    assert record["light_fits"]["c1a"]["summary"].startswith("fitted on the map")
+    assert figures["near"]["points"] < figures["fitted"]["points"]
+
+
+def test_settings_of_what_makes_maps_dense_are_refused_where_nothing_does(trees, tmp_path):
+    maps = one_sequence(trees, tmp_path / "maps")
+    for more in ({"recipe": "paper"}, {"light": "gamma=2.2,mu=0"}, {"fit_light": False}):
+        with refused(cure="--checkpoint"):
+            evaluate(maps, trees[0], tmp_path / "out", suite=SUITE, **more)
 
 
 def changed(path: Path, **changes) -> Path:

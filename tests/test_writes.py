@@ -43,6 +43,7 @@ ALLOWED = {
     "lightdepth/uncalibrated.py: found_camera": "in a temporary folder that is no output",
     "densify/commands/bench.py: run": _RUN,
     "densify/commands/bench.py: compare_estimators": _RUN,
+    "densify/commands/bench.py: compare_per_frame": _RUN,
     "densify/dense_map.py: write": _RUN,
     "densify/densified.py: write": _RUN,
     "densify/exporting/work.py: export_maps": _RUN,

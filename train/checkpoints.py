@@ -26,7 +26,7 @@ from lightdepth.checkpoint import load_model
 from lightdepth.command_line.signals import Received
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.weights import read_pickled
-from lightdepth.files.writing import write_whole
+from lightdepth.files.writing import is_dead_partial, write_whole
 
 LAST, PREVIOUS, BEST = "last.ckpt", "last-previous.ckpt", "best.ckpt"
 _SEEDS_APART = 1_000_003
@@ -107,6 +107,14 @@ def _keep(path: Path, previous: Path) -> None:
         os.replace(path, previous)
     else:
         os.replace(beside, previous)
+        beside.unlink(missing_ok=True)  # which a rename leaves where both are one file already: after a kill
+
+
+def clear_cut_off(folder: Path) -> None:
+    """Removes what a killed run had written of checkpoints: the next ones may have other names."""
+    for path in folder.glob(".*"):
+        if is_dead_partial(path) or path == folder / f".{PREVIOUS}":
+            path.unlink(missing_ok=True)
 
 
 class Checkpoints(pl.Callback):

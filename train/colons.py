@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
@@ -12,6 +13,8 @@ from lightdepth.frame import FrameBatch, to_batch
 from lightdepth.ranges import BELOW_ONE, COUNT, Range, at_least, checked, ends_of
 from lightdepth.tube.path import Lens
 from lightdepth.tube.scene import TubeConfig
+
+Family = Literal["plain", "realistic", "mixed", "wide"]
 
 
 @dataclass(frozen=True)
@@ -45,10 +48,14 @@ class TubeData:
     reflectance: Annotated[tuple[float, float], ends_of(BELOW_ONE)] = (0.0, 0.7)
     """Range [low, high] from which each colon's reflectance is drawn, the share of light, in [0, 1), that its wall
     throws back onto other wall. A larger one makes more indirect light."""
-    family: Literal["plain", "realistic", "mixed"] = "plain"
+    family: Family = "plain"
     """Kind of colons: plain, tubes with folds under the endoscope's light; realistic, with polyps, mucus, motion blur
     and whatever else real images have; mixed, as realistic, but one scene of five is a hollow of any form instead, and
-    each has a round or eight-sided field of view of its own."""
+    each has a round or eight-sided field of view of its own; wide, as mixed, over wider ranges of shape, paint and
+    exposure, with the light between walls reckoned in another way from colon to colon."""
+    val_family: Family | Literal["variant"] | None = None
+    """Kind of colons to validate on, and to set the size of the uncertainty by: one of the families, or variant, of
+    another make than any that is trained on. Left out, that of those to train on."""
     scene: TubeConfig | None = None
     """Ranges that the colons are drawn from, in place of those of the family: a mapping in a --config file, or
     --data.tube.scene.shape.length 150 and the like, named as below --scene in `lightdepth synth --help-all`. mu, gamma
@@ -73,10 +80,20 @@ _FIELD = 17  # tells the draw of the field of view from the colon's own
 _HOLLOWS = (2,)  # of five; lenses, in turn, meet both families
 
 
+_MIXED = ("mixed", "wide")
+
+
+_STRENGTHS: tuple[Literal["weak", "strong"], ...] = ("weak", "strong")
+
+
 def colon_seeds(tube: TubeData, seed: int) -> tuple[range, range]:
     """The colons that data of a seed train and validate on."""
     first = seed * _SEEDS_APART
     return range(first, first + tube.scenes), range(first + _VAL_SEEDS, first + _VAL_SEEDS + tube.val_scenes)
+
+
+SceneMaker = Callable[[TubeData, int, int, tuple[int, int]], list[FrameBatch]]
+"""The frames of one colon as batches of one, from a seed, the colon's place in the run, and width and height."""
 
 
 def with_reflectance(batch: FrameBatch, reflectance: torch.Tensor) -> FrameBatch:
@@ -89,17 +106,32 @@ def tube_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> 
     from lightdepth.tube import any_field, lens, tube_frames
 
     camera, config = lens(tube.lenses[index % len(tube.lenses)], *size), tube_config(tube, index)
-    mask = any_field(camera, np.random.default_rng([seed, _FIELD])) if tube.family == "mixed" else None
+    mask = any_field(camera, np.random.default_rng([seed, _FIELD])) if tube.family in _MIXED else None
     frames = tube_frames(seed, tube.frames, camera, tube.travel, config, mask=mask, device=tube.device)
     return [to_batch(frame, size) for frame in frames]
 
 
+def val_scene(tube: TubeData, seed: int, index: int, size: tuple[int, int]) -> list[FrameBatch]:
+    """The frames of one synthetic colon to validate on."""
+    if tube.val_family == "variant":
+        from lightdepth.tube import lens
+        from lightdepth.tube.variant import variant_frames
+
+        camera, strength = lens(tube.lenses[index % len(tube.lenses)], *size), _STRENGTHS[index % 2]
+        frames = variant_frames(seed, tube.frames, camera, strength, tube.travel)
+        return [to_batch(frame, size) for frame in frames]
+    return tube_scene(replace(tube, family=tube.val_family or tube.family), seed, index, size)
+
+
 def tube_config(tube: TubeData, index: int = 0) -> TubeConfig:
     """What the index-th colon and its endoscope are drawn from."""
-    from lightdepth.tube import cavity, realistic
+    from lightdepth.tube import cavity, realistic, wide_colon, wide_hollow
 
-    family = TubeConfig()
-    if tube.family != "plain":
-        family = cavity() if tube.family == "mixed" and index % 5 in _HOLLOWS else realistic()
-    config = tube.scene or family
+    colon, hollow = {
+        "plain": (TubeConfig, TubeConfig),
+        "realistic": (realistic, realistic),
+        "mixed": (realistic, cavity),
+        "wide": (wide_colon, wide_hollow),
+    }[tube.family]
+    config = tube.scene or (hollow if index % 5 in _HOLLOWS else colon)()
     return replace(config, sensor=replace(config.sensor, mu=tube.mu, gamma=tube.gamma, reflectance=tube.reflectance))

@@ -27,7 +27,7 @@ from lightdepth.losses import LossConfig
 from lightdepth.photometry import LightTerms, brightness, decode, encode
 from lightdepth.ranges import BELOW_ONE, BETWEEN, SEED, Range, at_least, checked, ends_of
 from lightdepth.reporting.progress import Progress
-from train.colons import TubeData, colon_seeds, tube_scene, with_reflectance
+from train.colons import SceneMaker, TubeData, colon_seeds, tube_scene, val_scene, with_reflectance
 from train.frame_lists import Listed, listed_rows, open_listed
 from train.order import Halves, Shuffled
 
@@ -174,8 +174,8 @@ class FrameDataModule(pl.LightningDataModule):
         if self.tube.scenes + self.tube.val_scenes > 0:
             with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
                 to_train_on, to_validate_on = colon_seeds(self.tube, self.config.seed)
-                train += self._colons(to_train_on, bar)
-                val += self._colons(to_validate_on, bar)
+                train += self._colons(tube_scene, to_train_on, bar)
+                val += self._colons(val_scene, to_validate_on, bar)
         if not train:
             raise InputError("data", "nothing to train on", "give --data.sequences FOLDER, or --data.tube.scenes N")
         if not val:
@@ -221,10 +221,10 @@ class FrameDataModule(pl.LightningDataModule):
         self.sequences, self.val_sequences = ([path for path, _ in part] for part in both)
         return both
 
-    def _colons(self, seeds: range, bar: Progress) -> list[Dataset[FrameBatch]]:
+    def _colons(self, make: SceneMaker, seeds: range, bar: Progress) -> list[Dataset[FrameBatch]]:
         made: list[Dataset[FrameBatch]] = []
         for i, seed in enumerate(seeds):
-            frames = tube_scene(self.tube, seed, i, self.size)
+            frames = make(self.tube, seed, i, self.size)
             made.append(_Cached(frames, [f"colon {seed} frame {k}" for k in range(len(frames))]))
             bar.advance()
         return made

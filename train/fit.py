@@ -37,7 +37,7 @@ from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit
 
 from .callbacks import validation_line
 from .card import Card, Doubt
-from .checkpoints import BEST, LAST, Start, newest
+from .checkpoints import BEST, LAST, Start, clear_cut_off, newest
 from .colons import TubeData
 from .datamodule import FrameDataModule
 from .folder import begin_in, first_process, has_checkpoint, training_folder
@@ -121,6 +121,7 @@ def _fitted(
     before = settings_before(folder) if start is not None else None
     if first_process():
         begin_in(folder)
+        clear_cut_off(folder / "checkpoints")
         settings = job.config_yaml
         if names.paths:
             write_inputs(folder, names.paths)
@@ -134,7 +135,7 @@ def _fitted(
     checkpoints = folder / "checkpoints"
     with finishing_first() as received:
         options = _with_callbacks(trainer_options, folder, echo, data, job.settings, received, start)
-        with _refusals_named(MisconfigurationException, ValueError, TypeError):
+        with _refusals_named(MisconfigurationException, ValueError, TypeError, RuntimeError):  # the last: of a cluster
             trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the parser checked them against Trainer
         if job.resume:
             echo(start.said if start else "nothing to resume: starting anew")

@@ -21,7 +21,7 @@ from .callbacks import Diagnosis, DiagnosisConfig, Panels, TrainingProgress
 from .checkpoints import Checkpoints, Start, WholeCheckpoints
 from .datamodule import FrameDataModule
 from .folder import first_process
-from .running import report_every
+from .running import NO_ROOT, report_every
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def with_callbacks(
     options["callbacks"] = [*(callbacks if isinstance(callbacks, list) else [callbacks]), *extra]
     options["enable_checkpointing"] = False  # ours take the place of Lightning's
     options["plugins"] = [WholeCheckpoints()]
-    options.setdefault("default_root_dir", str(folder))
+    options.setdefault("default_root_dir", NO_ROOT)
     return options
 
 

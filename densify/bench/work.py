@@ -24,7 +24,7 @@ from densify.evaluation.judged_map import JudgedMap
 from densify.evaluation.records import SurfaceFigures
 from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
 from densify.pipeline import densify
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.models import DepthModel
@@ -110,7 +110,7 @@ def predicted(
 
 def load_models(checkpoints: Sequence[str]) -> list[DepthModel]:
     """The models that the rows are named after. Raises InputError where two have one name."""
-    models = [load_model(checkpoint, details=False) for checkpoint in checkpoints]
+    models = [load_called(checkpoint, details=False, option="checkpoints") for checkpoint in checkpoints]
     names = [model.name for model in models]
     twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
     if twice is not None:

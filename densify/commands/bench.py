@@ -1,4 +1,5 @@
-"""The verb bench: a run of the benchmark, `bench compare A B`, `bench estimators`. Thin: arguments in, files out."""
+"""The verb bench: a run of the benchmark, `bench compare A B`, `bench estimators`, `bench per-frame`. Thin: arguments
+in, files out."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+from densify.bench import per_frame
 from densify.bench.cases import USUAL_CASES, Case
 from densify.bench.estimators import (
     NO_LIBRARY,
@@ -21,14 +23,17 @@ from densify.bench.estimators import (
 )
 from densify.bench.record import notes, read_bench, record, tables
 from densify.bench.scenes import Size, scenes
+from densify.bench.spoilt import SpoiltFrame, spoilt_frames, spoilt_tables
 from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, cells_of, load_models, predicted
 from densify.config import DensifyConfig, OfflineConfig, Recipe
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
+from lightdepth.files.images import write_image
 from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
+from lightdepth.judge_colons import JUDGE_COLONS
 from lightdepth.models import DepthModel
 from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
 from lightdepth.reporting.names import told
@@ -38,8 +43,12 @@ from lightdepth.reporting.run import Run, plain, recorded, run_folder
 
 
 def bench(argv: list[str]) -> int:
-    """The built-in benchmark on synthetic colons; `bench compare A B`; `bench estimators`."""
-    of: dict[str, Callable[..., None]] = {"compare": compare_runs, "estimators": compare_estimators}
+    """The built-in benchmark on synthetic colons; `bench compare A B`; `bench estimators`; `bench per-frame`."""
+    of: dict[str, Callable[..., None]] = {
+        "compare": compare_runs,
+        "estimators": compare_estimators,
+        "per-frame": compare_per_frame,
+    }
     if argv and argv[0] in of:
         of[argv[0]](**parse(of[argv[0]], f"bench {argv[0]}", argv[1:]))
     else:
@@ -60,7 +69,8 @@ def run(
     overwrite: bool = False,
     resume: bool = False,
 ) -> None:
-    """Synthetic colons made from seeds, judged row by row (bench compare A B, bench estimators: --help of each).
+    """Synthetic colons made from seeds, judged row by row (--help of bench compare A B, bench estimators and bench
+    per-frame says more).
 
     Args:
         output: Folder to make, with bench.json and bench.md.
@@ -74,7 +84,8 @@ def run(
         checkpoints: Depth models to compare, each a row: path of a checkpoint, bundled name, decline (a formula from
             how light fades, no network) or constant (all equally far).
         recipes: Ways to make surfaces that are compared: full (all steps), paper (as published: one scale per keyframe,
-            plain TSDF), or both. Options of agreement, bending, contradiction and rectify count for full alone.
+            plain TSDF, and the gates and the reach that densify --recipe paper names), or both. Options of agreement,
+            bending, contradiction and rectify count for full alone.
         cases: Errors that map points share, each tried with one scale a keyframe and in full, by the last of
             --checkpoints: clean (none), side (30 % of the points, on one side, 15 % too far), wide side (45 %, 30 %),
             drift (of scale, 30 %), fold (20 % one fold too far), loop (half closed where there is none), poses (a bent
@@ -198,6 +209,59 @@ def compare_estimators(
         text = "\n".join([*(t.markdown() for t in estimators_tables(records)), *(f"{line}\n" for line in said)])
         (folder.folder / "estimators.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         (folder.folder / "estimators.png").write_bytes(estimators_picture(records))
+        folder.log(text)
+
+
+def compare_per_frame(
+    output: Path = Path("runs/per-frame"),
+    checkpoints: tuple[str, ...] = (DEFAULT_CHECKPOINT, "lightdepth-self"),
+    colons: Path | None = None,
+    spoilt: bool = False,
+    overwrite: bool = False,
+    resume: bool = False,
+) -> None:
+    """Depth of single frames beside the closed form, on twelve colons of a renderer that nothing was trained on.
+
+    Args:
+        output: Folder to make, with per-frame.json and .md, and unless --colons is given the colons' frames and their
+            truth in colons/, each a sequence that predict and evaluate read, and a picture of them.
+        checkpoints: Depth models to judge, each a row: path of a checkpoint, bundled name or constant. The closed form
+            is always the first row.
+        colons: Folder colons/ of an earlier run, whose frames are taken in place of making them anew, which takes some
+            ten minutes.
+        spoilt: Judge frames with blur, smoke, water drops, clipping, noise and compression too, at five severities:
+            error, and the share that import would keep; some minutes more for each model.
+        overwrite: Replace a run made before.
+        resume: Go on with the run that was stopped there, as it was begun; colons that were judged are not made again.
+    """
+    arguments = recorded(output=output, checkpoints=checkpoints, colons=colons, spoilt=spoilt)
+    models = load_models(tuple(dict.fromkeys((per_frame.BASELINE, *checkpoints))))
+    rows: list[per_frame.ColonFigures] = []
+    bad: list[SpoiltFrame] = []
+    with run_folder(output, "bench per-frame", arguments, overwrite, resume) as folder:
+        folder.hash_inputs(colons=colons, **{checkpoint: Path(checkpoint) for checkpoint in checkpoints})
+        sequences = []
+        with Progress("Frames", sum(colon.frames for colon in JUDGE_COLONS)) as bar:
+            for colon in JUDGE_COLONS:
+                place = (folder.folder / "colons" if colons is None else colons) / colon.name
+                if not folder.done(colon.name):
+                    files = per_frame.write_colon(colon, place, bar.advance) if colons is None else []
+                    frames = per_frame.read_colon(colon, place)
+                    kept = [asdict(row) for row in per_frame.judged(colon, frames, models)]
+                    more = [asdict(row) for row in spoilt_frames(colon, frames, models)] if spoilt else []
+                    if not files:
+                        bar.advance(colon.frames)
+                    folder.finish_part(colon.name, files, {"clean": kept, "spoilt": more})
+                else:
+                    bar.advance(colon.frames)
+                sequences.append(per_frame.read_colon(colon, place))
+                rows += [per_frame.ColonFigures(**row) for row in folder.kept_of(colon.name)["clean"]]
+                bad += [SpoiltFrame(**row) for row in folder.kept_of(colon.name)["spoilt"]]
+        text = "\n".join(table.markdown() for table in [*per_frame.tables(rows), *spoilt_tables(bad)])
+        found = per_frame.record(rows) | {"spoilt": [asdict(row) for row in bad], "versions": versions()}
+        _write_json(folder, "per-frame.json", found)
+        (folder.folder / "per-frame.md").write_text(text, encoding="utf-8", errors="backslashreplace")
+        write_image(folder.folder / "colons.png", per_frame.contact_sheet(sequences))
         folder.log(text)
 
 

@@ -12,7 +12,7 @@ from densify.evaluation.judged_map import dense_models, read_run
 from densify.evaluation.tables import write_evaluations
 from densify.evaluation.truth import read_truth
 from densify.page import densify_page
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
 from lightdepth.datasets import open_sequence
 from lightdepth.maps import read_map
 from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
@@ -58,7 +58,7 @@ def demo(
         lens=lens,
         spurious=spurious,
     )
-    model = load_model(checkpoint, details=False)
+    model = load_called(checkpoint, details=False)
     with run_folder(output, "demo", arguments, overwrite) as run:
         with Progress("Rendering", frames) as bar:
             sequence = render_sequence(

@@ -9,7 +9,7 @@ from densify.densified import Densified
 from densify.inputs import MapSource, SurfaceFiles, doubts_of_inputs, fitted_light, map_and_frames
 from densify.joining import MergeConfig
 from densify.page import densify_page, joined_section
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.reporting.run import recorded, run_folder
@@ -46,7 +46,7 @@ def densify(
         resume: Go on with the run that was stopped there, as it was begun; a sparse map, a light and submaps that are
             done are not made again.
     """
-    model = load_model(checkpoint, details=False)  # before minutes are spent on a sparse map
+    model = load_called(checkpoint, details=False)  # before minutes are spent on a sparse map
     arguments = recorded(
         source,
         mapped,

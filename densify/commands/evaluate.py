@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from densify.config import DensifyConfig
 from densify.evaluation.depth_files import DepthReading
 from densify.evaluation.judge import judge_gap
 from densify.evaluation.judged_map import read_run
 from densify.evaluation.records import Sources
 from densify.evaluation.tables import write_evaluations
-from densify.judged import JudgingConfig, TruthSource, judge_asked, read_asked
-from lightdepth.checkpoint import load_model
+from densify.judged import DenseFirst, JudgingConfig, TruthSource, check_used, judge_asked, read_asked
+from lightdepth.checkpoint import load_called
 from lightdepth.command_line.options import Group
 from lightdepth.reporting.run import recorded, run_folder
 
@@ -25,6 +26,8 @@ def evaluate(
     trajectory: Path | None = None,
     judging: Group[JudgingConfig] = JudgingConfig(),
     reading: Group[DepthReading] = DepthReading(),
+    config: Group[DensifyConfig] = DensifyConfig(),
+    fit_light: bool = True,
     overwrite: bool = False,
 ) -> None:
     """Errors of predictions, a densify run, a map or a trajectory, against truth and between submaps.
@@ -37,29 +40,34 @@ def evaluate(
             by which the gap between their surfaces is judged.
         suite: YAML file naming the sequences, folders of these names in run and truth, that are judged into one table
             (configs/bench/c3vd.yaml).
-        checkpoint: Depth model by which a sparse map is made dense first, as densify does by default: path of a
-            checkpoint, bundled name, decline or constant; the surfaces are written. Left out, its points alone are
-            judged.
+        checkpoint: Depth model by which a sparse map is made dense first, as densify does with --recipe and its other
+            settings: path of a checkpoint, bundled name, decline or constant; the surfaces are written. Left out, its
+            points alone are judged.
         trajectory: TUM file with the pose of every frame that the SLAM localised, judged in place of the keyframes'
             poses.
+        fit_light: With --checkpoint, where neither --light nor the truth's folder gives the light, fit it on each map,
+            and use it if depth by it fits hidden blocks of wall better; switched off, a usual light is assumed.
         overwrite: Replace metrics made before (evaluation/ in a run is replaced without asking).
     """
     arguments = recorded(
         source,
         judging,
         reading,
+        config,
         run=run,
         output=output,
         join=join,
         suite=suite,
         checkpoint=checkpoint,
         trajectory=trajectory,
+        fit_light=fit_light,
     )
     asked = read_asked(run, source, judging, join, suite, trajectory, output is None, reading)
-    model = None if checkpoint is None else load_model(checkpoint, details=False)
+    check_used(checkpoint, source, config, fit_light)
+    first = None if checkpoint is None else DenseFirst(load_called(checkpoint, details=False), config, fit_light)
     gap = None if join is None else judge_gap(read_run(run), join)
     with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite or output is None) as out:
         out.hash_inputs(truth=source.truth)
-        answer = judge_asked(asked, model, out)
-        sources = Sources(run, source.truth, gap)
+        answer = judge_asked(asked, first, out)
+        sources = Sources(run, source.truth, gap, "" if first is None else str(first))
         out.log(write_evaluations(answer.found, out.folder, answer.withheld, sources, asked.suite))

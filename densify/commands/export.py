@@ -7,7 +7,7 @@ from typing import Annotated, Literal, get_args
 
 from densify.dense_map import map_folders
 from densify.exporting.work import MAP_KINDS, MapExport, export_maps
-from lightdepth.checkpoint import load_model
+from lightdepth.checkpoint import load_called
 from lightdepth.command_line.options import Group
 from lightdepth.errors import InputError, MissingOption
 from lightdepth.exporting.work import DEPTH_KINDS, MODEL_KINDS, export_depth, export_model
@@ -72,7 +72,7 @@ def export(
 
 def _network(checkpoint: str) -> NetworkModel:
     """The checkpoint of a trained network."""
-    model = load_model(checkpoint)
+    model = load_called(checkpoint, option="what")
     if not isinstance(model, NetworkModel):
         raise InputError(checkpoint, "no network, and so without weights", "expected the checkpoint of a trained one")
     return model

@@ -9,7 +9,7 @@ from densify.config import LiveConfig
 from densify.inputs import MapSource, doubts_of_inputs, fitted_light, map_and_frames
 from densify.live.play import play
 from densify.live.record import PlayedRun
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
@@ -54,7 +54,7 @@ def live(
         raise InputError("--budget-ms", f"{budget_ms}", "expected milliseconds above 0")
     if rate is not None and not rate > 0:
         raise InputError("--rate", f"{rate}", "expected keyframes per second, above 0")
-    model = load_model(checkpoint, details=False)
+    model = load_called(checkpoint, details=False)
     arguments = recorded(
         source,
         mapped,

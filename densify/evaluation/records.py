@@ -359,7 +359,7 @@ class Evaluation(Generic[Judged]):
 
 @dataclass(frozen=True)
 class Sources:
-    """What a user gave to be judged, and the gap between two submaps where it was asked for."""
+    """What a user gave to be judged, how it was made dense, and the gap between two submaps where it was asked for."""
 
     run: Path
     """what was judged"""
@@ -367,10 +367,13 @@ class Sources:
     """what it was judged against; `truth_folder` in the file"""
     gap: MapGap | None = None
     """not in the file where it was not asked for"""
+    made: str = ""
+    """how sparse maps were made dense first; empty, and not in the file, where none was"""
 
     def record(self) -> dict[str, Any]:
         gap = {} if self.gap is None else {"gap": plain(self.gap.record())}
-        return {"run": str(self.run), "truth_folder": self.truth and str(self.truth), **gap}
+        made = {"made_dense": self.made} if self.made else {}
+        return {"run": str(self.run), "truth_folder": self.truth and str(self.truth), **gap, **made}
 
 
 def metrics_record(

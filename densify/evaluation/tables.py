@@ -282,6 +282,7 @@ def write_evaluations(
     if withheld:
         tables.append(withheld_table(withheld))
     notes = _notes(results, None if sources is None else sources.gap)
+    notes += [f"{sources.made}.\n"] if sources is not None and sources.made else []
     text = "\n".join([*(t.markdown() for t in tables), *notes])
     (folder / "metrics.md").write_text(text.rstrip() + "\n", encoding="utf-8", errors="backslashreplace")
     comments = "".join(f"% {line}\n" for note in notes for line in note.splitlines() if line)

@@ -12,13 +12,12 @@ from densify.dense_map import Surface
 from densify.evaluation.errors import CUBE_MM, TrueSurface, depth_triangles, true_cloud
 from densify.evaluation.trajectory import span
 from lightdepth.datasets import FrameSequence
+from lightdepth.datasets.c3vd_surface import COVERAGE_MESH
 from lightdepth.datasets.checks import unusable_truth
 from lightdepth.errors import InputError
 from lightdepth.files.meshes import read_mesh
 from lightdepth.frame import Frame
 
-COVERAGE_MESH = "coverage_mesh.obj"
-"""C3VD's true surface, in the frame of reference of its poses."""
 _MESH_FRAMES, _MESH_TRIANGLES = 50, 2_000_000
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from densify.dense_map import DenseMap
+from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.observations import ObservedDistances
 from lightdepth.sparse_map import Keyframe
@@ -125,7 +126,11 @@ def withheld_errors(folder: Path) -> list[WithheldOfMap]:
     if not file.is_file():
         return []
     found = []
-    for told in read_json(file).get("maps", []):
+    maps = read_json(file)
+    maps = maps.get("maps", []) if isinstance(maps, dict) else None
+    if not isinstance(maps, list):
+        raise InputError(file, "not as a run writes it", "expected the run.json of a densify run")
+    for told in maps:
         if isinstance(told, dict) and told.get("judge"):
             judged = checked_fields(_Judged, told, f"{file}: maps")
             found.append(WithheldOfMap(judged.map, *judged.judge.read()))

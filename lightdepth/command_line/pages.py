@@ -132,7 +132,7 @@ PAGES = {
             "lightdepth evaluate runs/dense --truth data/mine",
             "lightdepth evaluate runs/slam --truth data/mine -o runs/errors --thresholds-mm '[1, 3]'",
         ),
-        rare=("trajectory", "truth_mesh", "common"),
+        rare=("trajectory", "truth_mesh", "common", "join", "keep_mb", "bit_depth"),
     ),
     "bench": Page(
         (
@@ -150,6 +150,12 @@ PAGES = {
         (
             "lightdepth bench estimators -o runs/estimators",
             "lightdepth bench estimators -o runs/estimators --draws 200 --points 50",
+        )
+    ),
+    "bench per-frame": Page(
+        (
+            "lightdepth bench per-frame -o runs/per-frame",
+            "lightdepth bench per-frame -o runs/mine --colons runs/per-frame/colons --checkpoints '[mine.safetensors]'",
         )
     ),
     "measure": Page(

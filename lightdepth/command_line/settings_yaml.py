@@ -48,7 +48,7 @@ def _loaded(text: str) -> Any:
     plain_yaml.check(text)
     try:
         return with_words(_library(text))
-    except (ValueError, OverflowError) as error:  # a number of 5000 digits
+    except (ValueError, OverflowError, LookupError, AttributeError, TypeError) as error:  # 5000 digits; `!!bool x`
         raise yaml.YAMLError(str(error)) from error
 
 

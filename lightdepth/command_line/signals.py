@@ -66,13 +66,13 @@ class _Layer:
             self._interrupts, self._last_interrupt = self._interrupts + 1, time.monotonic()
         if self._interrupts >= _INSISTED:
             _die_of(number)
+        if self.raised is not None and self.raised() is not None:
+            return  # it is on its way: what cleans up is not torn
         if self.holding is not None:
             first = not self.holding.signal
             self.holding.signal = self.holding.signal or number
             if first or self._interrupts < 2:
                 return
-        if self.raised is not None and self.raised() is not None:
-            return  # it is on its way: what cleans up is not torn
         # Where nothing holds the first one any more, something swallowed it (a destructor, a callback of C).
         _raise(number)
 

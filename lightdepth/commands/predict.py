@@ -8,18 +8,20 @@ from typing import Annotated
 
 import numpy as np
 
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
 from lightdepth.colour import ColourMeter
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.hidden_uncertainty import read_factor
+from lightdepth.models import DepthModel
 from lightdepth.prediction import DepthPrediction
 from lightdepth.ranges import at_least
 from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.reporting.batches import batches
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
+from lightdepth.reporting.names import names_of
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.uncalibrated import open_frames
@@ -61,8 +63,8 @@ def predict(
         raise InputError("--refine", f"{refine}", "expected a number of steps, 0 for none")
     if refine and uncertainty is not None:
         raise InputError("--uncertainty", "refined distance has no uncertainty", "leave out one of it and --refine")
-    model = load_model(checkpoint)
-    factor = None if uncertainty is None else read_factor(uncertainty, model.name)
+    model = load_called(checkpoint)
+    factor = None if uncertainty is None else read_factor(uncertainty, *_names(model, checkpoint))
     if refine:
         model = RefinedModel(model, RefineConfig(steps=refine))
     with run_folder(output, "predict", arguments, overwrite, resume) as run:
@@ -116,3 +118,9 @@ def _written(folder: Path, frame: Frame, prediction: DepthPrediction, previews: 
     colors = colored_distance(prediction.distance, prediction.valid)
     preview.write_bytes(png(side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)])))
     return [file, preview]
+
+
+def _names(model: DepthModel, checkpoint: str) -> tuple[str, ...]:
+    """What a run may call the checkpoint, whether it keeps names or not."""
+    hidden = names_of({"checkpoint": checkpoint}).text(model.name)
+    return model.name, hidden, Path(checkpoint).resolve().name, Path(checkpoint).stem

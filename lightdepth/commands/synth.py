@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from lightdepth.calibration import read_light
 from lightdepth.command_line.options import Group
+from lightdepth.datasets.c3vd import C3VD
 from lightdepth.errors import InputError
 from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least, checked
 from lightdepth.reporting.progress import Progress
@@ -22,6 +23,8 @@ from lightdepth.tube.scene import TubeConfig, realistic
 from lightdepth.tube.sequence import TubeSequence
 from lightdepth.tube.slam import SlamConfig, simulate_slam
 
+_SIZE = (320, 256)
+
 
 @dataclass(frozen=True)
 @checked
@@ -34,8 +37,9 @@ class ColonConfig:
     frames: Annotated[int, COUNT] = 120
     """Number of frames to render, spread evenly over --travel-mm. More lie closer together on the same path, and take
     longer."""
-    size: Annotated[tuple[int, int], at_least(8, up_to=10_000)] = (320, 256)
-    """Width and height of the images, pixels. A larger one shows finer detail and takes longer."""
+    size: Annotated[tuple[int, int] | None, at_least(8, up_to=10_000)] = None
+    """Width and height of the images, pixels; left out, 320 x 256, but 1350 x 1080 with --layout c3vd, as the data set
+    has it (25 MB of memory and several seconds a frame). A larger one shows finer detail and takes longer."""
     seed: Annotated[int, SEED] = 0
     """Number that draws the colon, its light, the path and the SLAM's errors. Another one draws others."""
     travel_mm: Annotated[float, at_least(0, up_to=10_000)] = 36.0
@@ -51,6 +55,25 @@ class ColonConfig:
     """Where frames are rendered: cpu, cuda (a GPU; needs the extra gpu), or auto, the GPU where there is one and that
     extra is installed."""
 
+    def in_layout(self, layout: str) -> ColonConfig:
+        """With the size of the layout, where none was given. Raises InputError for what the layout cannot hold."""
+        if layout == "endomapper" and self.lens == "c3vd":
+            raise InputError("--layout endomapper", "it holds no Scaramuzza lens, as C3VD's is", "add --lens fisheye")
+        if layout != "c3vd":
+            return replace(self, size=self.size or _SIZE)
+        if self.lens != "c3vd":
+            raise InputError(
+                "--layout c3vd", f"it holds no camera: {self.lens} would be read as C3VD's", "leave out --lens"
+            )
+        width, height = self.size or (C3VD.width, C3VD.height)
+        if abs(width / height / (C3VD.width / C3VD.height) - 1) > 0.01:
+            raise InputError(
+                "--layout c3vd",
+                f"images of {width}x{height}, whose sides are not as those of C3VD's",
+                f"leave out --size, or take one as 5 to 4: {C3VD.width}x{C3VD.height} and its reductions",
+            )
+        return replace(self, size=(width, height))
+
     def rendered(
         self, scene: TubeConfig, breathing: BreathingConfig, progress: Callable[[int, int], None]
     ) -> TubeSequence:
@@ -62,7 +85,7 @@ class ColonConfig:
                 )
             scene = realistic()
         chosen = read_light(self.light) if self.light is not None else None
-        camera = tube_lens(self.lens, *self.size)
+        camera = tube_lens(self.lens, *(self.size or _SIZE))
         return render_sequence(
             self.seed,
             self.frames,
@@ -91,8 +114,9 @@ def synth(
 
     Args:
         output: Folder to make, with the frames, their truth and the SLAM export.
-        layout: How the files of the sequence are laid out: frames (our own folder), c3vd (as C3VD), or endomapper
-            (out1.png, ... and XML, its truth in truth/sequence; not with --lens c3vd).
+        layout: How the files of the sequence are laid out: frames (our own folder), c3vd (as C3VD, with normals, flow,
+            occlusion and the mesh of what was seen, unless the wall moves; for --lens c3vd), or endomapper (out1.png,
+            ... and XML, its truth in truth/sequence; not with --lens c3vd).
         spurious: Share of the map points, in [0, 1), that are wrong; it wins over --slam.spurious, which holds where
             this is left out. A larger one makes the map harder to densify.
         scene: ranges of shape, texture and sensor of plain colons
@@ -114,8 +138,7 @@ def synth(
     slam = slam if spurious is None else replace(slam, spurious=spurious)
     if slam.spurious is not None and not 0 <= slam.spurious < 1:
         raise InputError("--spurious", f"{slam.spurious}", "expected a share of at least 0 and below 1")
-    if layout == "endomapper" and colon.lens == "c3vd":
-        raise InputError("--layout endomapper", "it holds no Scaramuzza lens, as C3VD's is", "add --lens fisheye")
+    colon = colon.in_layout(layout)
     with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", colon.frames) as bar:
         sequence = colon.rendered(scene, breathing, lambda *_: bar.advance())
         made = sequence.frames
@@ -124,5 +147,6 @@ def synth(
         right = simulate_slam(made, slam, colon.seed, sequence.breathing)
         export = replace(right, map=with_errors(right.map, errors, colon.seed))
         moved = None if errors == MapErrors() else moved_ids(right.map, export.map)
-        write_synthetic(made, export, run.folder, layout, moved)
+        wall = None if sequence.breathing is not None else sequence.tube.shape  # no one mesh holds a wall that moves
+        write_synthetic(made, export, run.folder, layout, moved, wall)
         run.log(f"{colon.frames} frames, {len(export.map.submaps)} submaps in {output}")

@@ -6,6 +6,7 @@ people, and for other machines, whose kernels do not know of each other.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -16,7 +17,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError
+
+_LOCK = {"host", "pid", "time"}
+"""What a lock of ours says at least."""
+
+_AS_IT_IS = os.O_NOFOLLOW | os.O_NONBLOCK
+"""A link is not followed, and a pipe with nobody at its other end not waited for."""
 
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
@@ -24,16 +32,21 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 @contextmanager
 def locked(output: Path) -> Iterator[None]:
     """Within it no other run writes to `output`. Raises InputError, naming host, process and time, when one does."""
-    path = lock_path(output)
-    descriptor = _opened(path, output)
+    path, descriptor = lock_path(output), None
     try:
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
+        with finishing_first():
+            descriptor = _opened(path, output)
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
         yield
     finally:
-        if _is_at(descriptor, path):
-            path.unlink(missing_ok=True)  # while it is held: whoever waits for it sees that it is gone
-        os.close(descriptor)
+        if descriptor is not None:
+            with finishing_first():
+                try:
+                    if _is_at(descriptor, path):
+                        path.unlink(missing_ok=True)  # while it is held: whoever waits for it sees that it is gone
+                finally:
+                    os.close(descriptor)
 
 
 def lock_path(output: Path) -> Path:
@@ -44,7 +57,7 @@ def lock_path(output: Path) -> Path:
 def is_live(output: Path) -> bool:
     """Whether a run writes to `output` now, as far as this machine can know: what another machine holds counts."""
     try:
-        descriptor = os.open(lock_path(output), os.O_RDONLY)
+        descriptor = os.open(lock_path(output), os.O_RDONLY | _AS_IT_IS)
     except OSError:
         return False
     try:
@@ -59,17 +72,24 @@ def is_live(output: Path) -> bool:
 def is_lock(path: Path) -> bool:
     """Whether a file is a lock of ours."""
     try:
-        with path.open("rb") as file:
-            found = _read(file.fileno())
+        descriptor = os.open(path, os.O_RDONLY | _AS_IT_IS)
     except OSError:
         return False
-    return {"host", "pid", "time"} <= set(found)
+    try:
+        return set(_read(descriptor)) >= _LOCK
+    finally:
+        os.close(descriptor)
 
 
 def _opened(path: Path, output: Path) -> int:
     """The lock file, held."""
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | _AS_IT_IS, 0o644)
+        except OSError as error:
+            if error.errno != errno.ELOOP:
+                raise
+            raise _in_the_way(path, output) from error  # a link: what it leads to would be written over
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -89,6 +109,9 @@ def _opened(path: Path, output: Path) -> int:
             os.close(descriptor)
             continue
         holder = _read(descriptor)
+        if not set(holder) >= _LOCK and (holder or not _is_torn(descriptor)):
+            os.close(descriptor)
+            raise _in_the_way(path, output)
         if holder and not _is_ours(holder):
             os.close(descriptor)
             raise InputError(
@@ -129,6 +152,17 @@ def _read(descriptor: int) -> dict[str, Any]:
     except (ValueError, OSError):
         return {}  # its holder had not written yet
     return found if isinstance(found, dict) else {}
+
+
+def _in_the_way(path: Path, output: Path) -> InputError:
+    found = f"{path.name} beside it is in the way, and was not made by this program"
+    return InputError(output, found, "rename it, or choose another -o")
+
+
+def _is_torn(descriptor: int) -> bool:
+    """Whether a kill or a power cut left nothing, zeros or the beginning of what a lock of ours says."""
+    left, ours = os.pread(descriptor, 4096, 0).strip(b"\0"), b'{"host"'
+    return left.startswith(ours) or ours.startswith(left)
 
 
 def _told(holder: dict[str, Any]) -> str:

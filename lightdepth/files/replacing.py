@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError
 from lightdepth.files.lock import is_live, is_lock, lock_path
 from lightdepth.files.writing import PARTIAL, check_writable, is_dead_partial, move_whole, sync, sync_below
@@ -89,17 +90,18 @@ def try_place(output: Path) -> None:
     """Does with what stands at `output` what the end of the run will do. Raises InputError where that will not go."""
     probe = old_path(output)
     try:
-        if output.is_dir():
-            os.rename(output, probe)
-            os.rename(probe, output)
-        else:
-            probe.mkdir()
-            try:
+        with finishing_first():
+            if output.is_dir():
+                os.rename(output, probe)
                 os.rename(probe, output)
-            finally:
-                with suppress(OSError):
-                    probe.rmdir()
-            output.rmdir()
+            else:
+                probe.mkdir()
+                try:
+                    os.rename(probe, output)
+                finally:
+                    with suppress(OSError):
+                        probe.rmdir()
+                output.rmdir()
     except OSError as error:
         if error.errno in (errno.EBUSY, errno.EXDEV):
             raise InputError(
@@ -112,18 +114,31 @@ def try_place(output: Path) -> None:
 
 def read_record(folder: Path) -> dict[str, Any] | None:
     """The run.json of a folder that this program wrote, or None."""
+    if not (folder / RECORD).is_file():
+        return None  # a pipe would be waited for
     try:
         found = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    ours = isinstance(found, dict) and isinstance(found.get("verb"), str) and isinstance(found.get("versions"), dict)
-    return found if ours else None
+    kinds = {"verb": str, "versions": dict}
+    if not (isinstance(found, dict) and all(isinstance(found.get(name), kind) for name, kind in kinds.items())):
+        return None
+    whole = all(isinstance(found.get(name, {}), dict) for name in ("arguments", "inputs"))
+    return found if whole and all(isinstance(known, dict | str) for known in found.get("inputs", {}).values()) else None
 
 
 def listed(folder: Path) -> dict[str, int]:
-    """Every file below a folder, links too, with its size in bytes: names as run.json has them, in order."""
+    """Every file of a run, links too, with its size in bytes: names as run.json has them, in order."""
     own = {folder / name for name in (RECORD, BEGUN, PARTS)}
-    return {str(p.relative_to(folder)): p.lstat().st_size for p in sorted(_files(folder)) if p not in own}
+    found = (p for p in sorted(below(folder)) if p not in own and not p.is_relative_to(folder / STATE))
+    return {str(p.relative_to(folder)): p.lstat().st_size for p in found}
+
+
+def clear_notes(folder: Path) -> None:
+    """Removes from a run that is whole what an unfinished one is resumed from."""
+    discard(folder / STATE)
+    for name in (BEGUN, PARTS):
+        (folder / name).unlink(missing_ok=True)
 
 
 def check_replaceable(output: Path, verb: str) -> None:
@@ -138,7 +153,7 @@ def check_replaceable(output: Path, verb: str) -> None:
         found = "not overwritten, its run.json is of an earlier version and does not say which files are the run's"
         raise InputError(output, found, cure)
     ours = _owned(output)
-    for path in sorted(_files(output)):
+    for path in sorted(below(output)):
         if path not in ours:
             found = f"not overwritten, {path.relative_to(output)} in it is not of the run that made it"
             raise InputError(output, found, "move that file elsewhere, or choose another -o")
@@ -183,8 +198,14 @@ def check_rewritable(path: Path, beginning: str, inputs: Iterable[Path | None] =
 def replace(made: Path, output: Path, before: Stamp) -> None:
     """The finished folder takes its place; what was there goes last, and of that only what its run.json lists.
 
-    Where something else came to stand there meanwhile, both are kept, and an InputError says where.
+    Where something else came to stand there meanwhile, both are kept, and an InputError says where. A signal waits for
+    the end of it.
     """
+    with finishing_first():
+        _replace(made, output, before)
+
+
+def _replace(made: Path, output: Path, before: Stamp) -> None:
     if stamp(output) != before and output.is_dir() and any(output.iterdir()):
         spare = _spare(output)
         move_whole(made, spare)
@@ -207,9 +228,14 @@ def replace(made: Path, output: Path, before: Stamp) -> None:
 def recover(output: Path) -> bool:
     """Finishes what a run that died at its last step had begun: what was there comes back, or goes. Only for whoever
     holds the lock. Returns whether a finished result took its place now."""
+    with finishing_first():
+        return _recover(output)
+
+
+def _recover(output: Path) -> bool:
     made, aside = unfinished_path(output), old_path(output)
     for path in (made, aside):
-        if path.exists() and not (read_record(path) or (path / BEGUN).is_file() or not any(path.iterdir())):
+        if os.path.lexists(path) and not _is_of_a_run(path):
             found = f"{path.name} beside it is in the way, and was not made by this program"
             raise InputError(output, found, "rename it, or choose another -o")
     complete = read_record(made) is not None
@@ -218,8 +244,7 @@ def recover(output: Path) -> bool:
         os.rename(aside, output)
         return False
     if complete and empty:
-        for name in (BEGUN, PARTS):
-            (made / name).unlink(missing_ok=True)
+        clear_notes(made)
         move_whole(made, output)
     if aside.is_dir():
         _remove_old(aside, output)
@@ -234,7 +259,7 @@ def _remove_old(aside: Path, output: Path) -> None:
 
 def remove_owned(folder: Path) -> bool:
     """Removes the files of a run, and no others; returns whether the folder is gone."""
-    ours = _owned(folder) & set(_files(folder))  # not through links
+    ours = _owned(folder) & set(below(folder))  # not through links
     records = {path for path in ours if path.name == RECORD}
     for path in [
         *sorted(ours - records),
@@ -261,7 +286,18 @@ def remains(parent: Path) -> Iterator[Path]:
 
 
 def discard(folder: Path) -> None:
-    """Removes a folder of our own making, as far as that goes: what fails here must not hide why."""
+    """Removes a folder of our own making, as far as that goes: what fails here must not hide why. What says that it is
+    ours goes last, and a result that is half removed says no more that it is whole."""
+    with suppress(OSError):
+        os.replace(folder / RECORD, folder / BEGUN)
+    with suppress(OSError):
+        for path in folder.iterdir():
+            if path.name == BEGUN:
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -275,9 +311,13 @@ def output_of(path: Path) -> Path | None:
 
 
 def _is_of_a_run(path: Path) -> bool:
-    """Whether what has such a name was written by this program: others hide files too."""
+    """Whether what has such a name was written by this program: others hide files too, and a link leads to theirs."""
+    if path.is_symlink():
+        return False
     if path.is_dir():
-        return (path / BEGUN).is_file() or read_record(path) is not None
+        said = (path / BEGUN).is_file() or read_record(path) is not None
+        # A run killed at its first or last step: its list is not there yet, or is gone and folders alone are left.
+        return said or all(f.name.startswith(PARTIAL) and f.name.endswith(BEGUN) for f in below(path))
     return path == lock_path(output_of(path) or path) and is_lock(path)
 
 
@@ -296,13 +336,14 @@ def _owned(folder: Path) -> set[Path]:
             path = Path(place) / name
             if ".." in path.parts or not path.is_relative_to(folder):  # a list that another wrote
                 continue
-            with suppress(OSError):
+            with suppress(OSError, ValueError):  # a text that is no name
                 if path.lstat().st_size == size:
                     owned.add(path)
     return owned
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def below(folder: Path) -> Iterator[Path]:
+    """The files below a folder, and links to folders, which are not followed."""
     for place, folders, names in os.walk(folder):
         yield from (Path(place) / name for name in names)
         yield from (Path(place) / name for name in folders if (Path(place) / name).is_symlink())

@@ -12,10 +12,12 @@ import hashlib
 import os
 import re
 import socket
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError
 from lightdepth.files.machine import FAILS
 
@@ -28,6 +30,8 @@ PARTIAL = ".partial-"
 
 _LONGEST = 255
 """What file systems take as a name, in bytes."""
+_BEFORE = len(PARTIAL) + 8 + 1 + 9 + 1
+"""Bytes that stand before the real name at the most, whatever number the process has: killed runs had others."""
 
 _NOT_HERE = (errno.EINVAL, errno.ENOTSUP)
 """Some file systems cannot bring a folder to the disk, and say so; a finished run is not lost over it."""
@@ -39,43 +43,81 @@ def write_whole(path: str | Path, content: Content) -> None:
 
 
 def write_together(contents: Mapping[Path, Content]) -> None:
-    """Several files: nothing takes its place before all are written; then they do, in the order given."""
+    """Several files: nothing takes its place before all are written; then they do, in the order given, and a signal
+    waits until all have."""
     partial = {path: _partial(path) for path in contents}
-    with ExitStack() as leftovers:
-        for unfinished in partial.values():
-            leftovers.callback(_remove, unfinished)
-        try:
-            for path, content in contents.items():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                _clear_dead(path)
-                _write(partial[path], content)
-                sync(partial[path])
+    try:
+        with folders_for(contents):
+            _write_together(contents, partial)
+    except OSError as error:
+        real = {os.fspath(unfinished): path for path, unfinished in partial.items()}
+        where = real.get(error.filename, error.filename or next(iter(contents)))
+        if error.errno in FAILS:
+            error.filename = os.fspath(where)  # writing alone names none
+            raise
+        raise InputError(where, f"cannot be written ({error.strerror or error})", "choose another place") from error
+
+
+def _write_together(contents: Mapping[Path, Content], partial: Mapping[Path, Path]) -> None:
+    try:
+        for path, content in contents.items():
+            _clear_dead(path)
+            _write(partial[path], content)
+            sync(partial[path])
+        with finishing_first():
             for path in contents:
                 os.replace(partial[path], path)
             for folder in {path.parent for path in contents}:
                 sync(folder)
-        except OSError as error:
-            real = {os.fspath(unfinished): path for path, unfinished in partial.items()}
-            where = real.get(error.filename, error.filename or next(iter(contents)))
-            if error.errno in FAILS:
-                error.filename = os.fspath(where)  # writing alone names none
-                raise
-            raise InputError(where, f"cannot be written ({error.strerror or error})", "choose another place") from error
+    finally:
+        with finishing_first():
+            for unfinished in partial.values():
+                _remove(unfinished)
+
+
+@contextmanager
+def folders_for(outputs: Iterable[Path]) -> Iterator[None]:
+    """Makes the folders that outputs are to be in; those that it made go where the block fails and leaves nothing."""
+    places = {path.parent for path in outputs}
+    missing = {folder for place in places for folder in (place, *place.parents) if not folder.exists()}
+    try:
+        for place in places:
+            place.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        with finishing_first():
+            for folder in sorted(missing, reverse=True):  # the innermost first
+                with suppress(OSError):  # something is kept in it
+                    folder.rmdir()
+        raise
 
 
 def check_writable(path: Path) -> None:
     """Raises InputError where a file cannot be written, before the work for it; nothing is left there."""
-    probe = _partial(path)
     try:
         existing = next(folder for folder in path.absolute().parents if folder.exists())
-        probe = existing / probe.name
-        probe.touch()
+        probe = _partial(existing / path.name)
+        with finishing_first():
+            _clear_dead(existing / path.name)
+            try:
+                probe.touch()
+            finally:
+                _remove(probe)
     except OSError as error:
         if error.errno in FAILS:
             raise
         raise InputError(path, f"cannot be written ({error.strerror or error})", "choose another place") from error
+
+
+def usual_mode(folder: Path) -> int:
+    """The mode that a new folder inside this one gets: by the umask, which says who may read what the user makes, and
+    by what a folder of a group hands on."""
+    probe = folder / f"{PARTIAL}mode"
+    probe.mkdir(exist_ok=True)
+    try:
+        return stat.S_IMODE(probe.stat().st_mode)
     finally:
-        _remove(probe)
+        probe.rmdir()
 
 
 def move_whole(made: Path, path: Path) -> None:
@@ -123,16 +165,19 @@ def is_dead_partial(path: Path) -> bool:
 
 def _partial(path: Path) -> Path:
     """A name beside a file for what is written of it, with its ending, of this process alone."""
-    name = f"{PARTIAL}{_machine()}-{os.getpid()}-{path.name}"
-    if len(os.fsencode(name)) > _LONGEST:
-        name = f"{PARTIAL}{_machine()}-{os.getpid()}-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]}"
-        name += path.suffix
-    return path.with_name(name)
+    return path.with_name(f"{PARTIAL}{_machine()}-{os.getpid()}-{_ending(path)}")
+
+
+def _ending(path: Path) -> str:
+    """How the names of a file's parts end: in its own name, or where that is too long in a hash of it."""
+    if len(os.fsencode(path.name)) + _BEFORE <= _LONGEST:
+        return path.name
+    return hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16] + path.suffix
 
 
 def _clear_dead(path: Path) -> None:
     """What killed runs had written of this file."""
-    for old in path.parent.glob(f"{PARTIAL}*-{glob.escape(path.name)}"):
+    for old in path.parent.glob(f"{PARTIAL}*-{glob.escape(_ending(path))}"):
         if is_dead_partial(old):
             _remove(old)
 

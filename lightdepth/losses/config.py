@@ -33,11 +33,19 @@ class LossConfig:
     """Weight of what rendered and seen RGB lack in structural similarity (SSIM), compared in windows of 5 x 5 pixels; 0
     leaves it out. A larger one follows the edges and the texture of the image more closely."""
     saturated: Annotated[float, at_least(0)] = 0.3
-    """Weight of the term on saturated pixels (see `white`), which counts only what is rendered darker than seen; 0
-    leaves it out. A larger one pulls wall that is too bright to measure nearer to the camera."""
+    """Weight of the term on saturated pixels (see `white`), which counts only what is rendered darker than seen, as if
+    the rendered image were clipped at white too; 0 leaves it out. A larger one pulls wall that is too bright to measure
+    nearer to the camera."""
     specular: Annotated[float, at_least(0)] = 0.0
-    """Weight of the term that takes saturated pixels for highlights, where the wall faces the light; 0 leaves it out. A
-    larger one turns the wall there more towards the camera."""
+    """Weight of the term on highlights (small saturated patches, see `highlight_size`), where the wall faces the light;
+    0 leaves it out. A larger one turns the wall there more towards the camera."""
+    highlight_size: Annotated[float, SHARE] = 0.005
+    """Largest patch of saturated pixels that counts as a highlight for `specular`, as a share, in [0, 1], of the
+    image's pixels inside the mask. A larger one takes near wall that is clipped for highlights too; 1 leaves size
+    out."""
+    highlight_contrast: Annotated[float, SHARE] = 0.1
+    """Least difference in brightness, in [0, 1], between such a patch and the wall around it, from which it counts as a
+    highlight for `specular`. A larger one leaves fewer of them; 0 does not look around."""
     facing: Annotated[float, at_least(0)] = 2.0
     """Weight of the term against wall that is seen nearly edge-on (cosine between its normal and the line of sight
     below `cosine_floor`); 0 leaves it out. A larger one turns such wall more towards the camera."""
@@ -83,7 +91,8 @@ class LossConfig:
     of brightness, or values in [0, 1]. A larger one makes small differences count less against large ones."""
     white: Annotated[float, SHARE] = 0.97
     """Brightness (the largest of R, G and B), in [0, 1], from which a pixel counts as saturated and is left to the
-    terms `saturated` and `specular`. A higher one leaves fewer pixels to them, and more to the photometric term."""
+    terms `saturated` and, in highlights, `specular`. A higher one leaves fewer pixels to them, and more to the
+    photometric term."""
     bounces: Annotated[int, at_least(0, up_to=1000)] = 3
     """Number of times that light thrown back by the wall is passed on once more to other wall, in rendered light; it
     matters only where `reflectance` is above 0. More are more exact and take longer."""

@@ -13,6 +13,7 @@ from lightdepth.geometry import normals_from_distance
 from lightdepth.losses import light as lit
 from lightdepth.losses import surface, truth
 from lightdepth.losses.config import LossConfig
+from lightdepth.losses.highlights import highlights
 from lightdepth.losses.masked import masked_median
 from lightdepth.photometry import bent, brightness, straightened
 
@@ -22,12 +23,14 @@ _V_FLOOR = 1e-2
 @dataclass(frozen=True)
 class Seen:
     """What the loss takes from the images alone, (B, 1, H, W) each: log V, which pixels are white, which tell of
-    distance, and the guide of the smoothness. A loss that is taken many times on the same images needs it once."""
+    distance, the guide of the smoothness, and which white ones are highlights (None where no term asks). A loss that is
+    taken many times on the same images needs it once."""
 
     log_v: Tensor
     saturated: Tensor
     usable: Tensor
     guide: Tensor
+    highlights: Tensor | None = None
 
     @classmethod
     def of(cls, batch: FrameBatch, config: LossConfig) -> Seen:
@@ -35,7 +38,10 @@ class Seen:
         log_v = straightened(v, config.shoulder).clamp(min=_V_FLOOR).log()
         saturated = batch.mask & (v >= config.white)
         usable = informative(batch.image, batch.mask) & ~saturated
-        return cls(log_v, saturated, usable, surface.smoothness_guide(log_v, batch.mask))
+        shine = None
+        if config.specular > 0:
+            shine = highlights(v, saturated, batch.mask, config.highlight_size, config.highlight_contrast)
+        return cls(log_v, saturated, usable, surface.smoothness_guide(log_v, batch.mask), shine)
 
 
 def self_supervised_loss(
@@ -84,8 +90,8 @@ def self_supervised_loss(
         terms["chroma"] = lit.chroma_loss(albedo_hs, image, light, mask & ~seen.saturated)
     if config.ssim > 0:
         terms["ssim"] = lit.ssim_loss(image, rendered, seen.usable)
-    if config.specular > 0:
-        terms["specular"] = lit.specular_loss(normals, rays, seen.saturated)
+    if seen.highlights is not None:
+        terms["specular"] = lit.specular_loss(normals, rays, seen.highlights)
     if config.albedo > 0 and albedo_hs is not None:
         terms["albedo"] = surface.albedo_loss(albedo_hs, mask)
     total = sum((getattr(config, name) * value for name, value in terms.items()), start=distance.new_zeros(()))

@@ -13,13 +13,13 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field, is_dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from lightdepth.command_line.config_words import configs
 from lightdepth.files.named_inputs import INPUTS, real_inputs
-from lightdepth.files.replacing import BEGUN, PARTS
+from lightdepth.files.replacing import BEGUN, PARTS, STATE
 from lightdepth.files.writing import PARTIAL
 from lightdepth.reporting.same import input_hash
 
@@ -93,7 +93,8 @@ class Names:
         """Puts names in the place of paths in the texts of a run folder in the making."""
         if not self._forms:
             return
-        for place, _, files in os.walk(folder):
+        for place, folders, files in os.walk(folder):
+            folders[:] = [name for name in folders if name != STATE]
             for name in files:
                 path = Path(place) / name
                 if path.suffix.lower() in TEXTS and name not in (INPUTS, BEGUN, PARTS) and not path.is_symlink():
@@ -150,9 +151,22 @@ class Names:
 
 
 def tells(word: str) -> bool:
-    """Whether a part of a path is more than a word of a language or a number, and so may stand for somebody."""
-    letters = any(letter.isalpha() for letter in word)
-    return len(word) > 2 and letters and not re.fullmatch(r"[a-z.]+|[\d.]+e\d+", word) and not _USUAL.fullmatch(word)
+    """Whether a part of a path may stand for somebody: it is no number, and no word that this program uses itself."""
+    if len(word) < 3 or not any(letter.isalpha() for letter in word) or _USUAL.fullmatch(word):
+        return False
+    if re.fullmatch(r"[a-z.]+", word):  # a report would be spoilt by a name in the place of each of its "data"
+        return any(len(part) > 3 and part not in _own_words() for part in word.split("."))
+    return not re.fullmatch(r"[\d.]+e\d+", word)
+
+
+@cache
+def _own_words() -> frozenset[str]:
+    """Words of lower-case letters in this program's sources, of which its reports are made."""
+    home, words = Path(__file__).resolve().parents[2], set[str]()
+    for package in ("lightdepth", "densify", "train"):
+        for path in (*(home / package).rglob("*.py"), *(home / package / "weights").glob("*.md")):
+            words |= set(re.findall(r"[a-z]{4,}", path.read_text(encoding="utf-8", errors="replace")))
+    return frozenset(words)
 
 
 def names_of(
@@ -190,6 +204,20 @@ def told(text: str, **inputs: object) -> str:
     """A sentence as a report has it, of a verb that makes no run folder: without the paths of its inputs, unless
     `--keep-names` was given."""
     return text if KEPT.get() else names_of(inputs).text(text)
+
+
+def spoken(arguments: Mapping[str, Any]) -> Callable[[str], str]:
+    """A function from a text to what a terminal is told: names of options where their paths stand, as nothing is hashed
+    for that, unless `--keep-names` was given; but the output as it was typed."""
+    if KEPT.get():
+        return lambda text: text
+    names = Names({option.replace("_", "-"): path for option, path in reversed([*_inputs(arguments)])})
+    output = str(arguments.get("output") or "")
+
+    def said(text: str) -> str:
+        return output.join(map(names.text, text.split(output))) if output else names.text(text)
+
+    return said
 
 
 def _inputs(value: Any, option: str = "input") -> Iterator[tuple[str, str]]:

@@ -6,24 +6,25 @@ files. A verb that fails leaves OUT as it was; one that can be resumed keeps its
 
 from __future__ import annotations
 
+import stat
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
+from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.lock import locked
 from lightdepth.files.machine import machine_failure
 from lightdepth.files.named_inputs import write_inputs
 from lightdepth.files.replacing import (
-    BEGUN,
-    PARTS,
     STATE,
     check_apart,
     check_replaceable,
+    clear_notes,
     discard,
     real_output,
     recover,
@@ -32,10 +33,10 @@ from lightdepth.files.replacing import (
     try_place,
     unfinished_path,
 )
-from lightdepth.files.writing import sync_below
-from lightdepth.reporting.names import KEPT, Names, names_of
+from lightdepth.files.writing import folders_for, sync_below, usual_mode
+from lightdepth.reporting.names import KEPT, Names, names_of, spoken
 from lightdepth.reporting.record import write_run_json
-from lightdepth.reporting.same import check_finished, check_same, compared
+from lightdepth.reporting.same import check_finished, check_same, compared, own_version
 from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
 from lightdepth.reporting.same import plain as plain
@@ -71,6 +72,8 @@ class Run:
         self._verb, self._given, self._start = verb, arguments, time.time()
         self._arguments = plain(arguments)
         self.keep_names = False
+        self._say: Callable[[str], str] | None = None
+        self._named = Names()
         self.unlisted: Mapping[str, Any] = {}  # inputs that do not stand among the arguments
 
     @property
@@ -119,8 +122,9 @@ class Run:
         return (self.parts or {})[part].kept
 
     def log(self, message: str) -> None:
-        """A line for the user and for log.txt."""
-        print(message, flush=True)
+        """A line for log.txt, and for the user, who reads the names of options in the place of their paths."""
+        self._say = self._say or (str if self.keep_names else spoken(self._given))
+        print(self._say(message), flush=True)
         self._note(message)
 
     def _note(self, message: str) -> None:
@@ -158,7 +162,12 @@ class Run:
     def _note_inputs(self, inputs: Mapping[str, Any]) -> None:
         """A run that is resumed compares them."""
         if self.parts is not None and not self.resumed:
-            begin(self.folder, {"verb": self._verb, "arguments": compared(self._arguments), "inputs": inputs})
+            self.begin(inputs)
+
+    def begin(self, inputs: Mapping[str, Any] | None = None) -> None:
+        """Notes what the run is begun with."""
+        said = {"verb": self._verb, "version": own_version(), "arguments": compared(self._arguments)}
+        begin(self.folder, {**said, "inputs": inputs or {}})
 
     @contextmanager
     def hearing(self) -> Iterator[None]:
@@ -195,21 +204,23 @@ class Run:
         argv = () if "command" in self.record else sys.argv
         return names_of(self._given, (self.output, self.folder), self.unlisted, argv, hashed)
 
-    def finish(self) -> None:
+    def settle(self) -> None:
+        """All files but run.json are as they stay, and on the disk."""
         import yaml
 
-        discard(self.state)
-        names = self.names()
+        self._named = names = self.names()
         settings = yaml.safe_dump(names.hidden(self._arguments, exactly=True), sort_keys=False)
         (self.folder / "config.yaml").write_text(settings, encoding="utf-8")
         names.hide_below(self.folder)
         if names.paths:
             write_inputs(self.folder, names.paths)
-        self.folder.chmod(0o755)
+        self.folder.chmod(usual_mode(self.folder))
         sync_below(self.folder)  # run.json says that the rest is whole: it comes last
-        write_run_json(self.folder, self._verb, self._arguments, self._start, self.record, names)
-        for name in (BEGUN, PARTS):
-            (self.folder / name).unlink(missing_ok=True)
+
+    def finish(self) -> None:
+        """The run says that it is whole."""
+        write_run_json(self.folder, self._verb, self._arguments, self._start, self.record, self._named)
+        clear_notes(self.folder)  # not before: a run that is killed until then goes on from its finished parts
 
 
 def recorded(*groups: object, **options: object) -> dict[str, object]:
@@ -241,15 +252,20 @@ def run_folder(
     real = real_output(output)
     run = None
     try:
-        with _parents(real), locked(real):
-            run = _begun(real, verb, arguments, overwrite, resume, [*paths_in(arguments), *paths_in(inputs)])
+        with folders_for([real]), locked(real), ExitStack() as ending:
+            parts = _checked(real, verb, arguments, overwrite, resume, [*paths_in(arguments), *paths_in(inputs)])
             before = stamp(real)
+            run = Run(unfinished_path(real), real, verb, arguments, None if resume is None else parts)
             run.keep_names = KEPT.get() if keep_names is None else keep_names
             run.unlisted = {"input": inputs}
             with _kept_or_gone(run, real, resume is not None), run.hearing():
+                _begin(run)
                 yield run
+                run.settle()
+                received = ending.enter_context(finishing_first())  # a signal waits until the result is in its place
                 run.finish()
             replace(run.folder, real, before)
+            received.stop(f"it was at its last step, and {real.name} is whole")
     except OSError as error:
         failure = machine_failure(error, place=real)
         if failure is not None:
@@ -266,34 +282,21 @@ def run_folder(
         )
 
 
-@contextmanager
-def _parents(output: Path) -> Iterator[None]:
-    """Makes the folders that an output is to be in; those that it made go where the block fails and leaves nothing."""
-    missing = [folder for folder in output.parents if not folder.exists()]
-    output.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    except BaseException:
-        for folder in missing:
-            with suppress(OSError):  # something is kept in it
-                folder.rmdir()
-        raise
-
-
-def _begun(
+def _checked(
     output: Path,
     verb: str,
     arguments: Mapping[str, Any],
     overwrite: bool,
     resume: bool | None,
     inputs: Iterable[Path],
-) -> Run:
-    """The run that is made or goes on, after all that can be refused before any work."""
+) -> dict[str, Part]:
+    """The finished parts that a run goes on from, after all that can be refused before any work."""
     if recover(output):
         print(f"{output.name} was finished by an earlier run, which was killed at its last step", flush=True)
     made = unfinished_path(output)
+    begun, parts = begun_with(made), finished_parts(made)
     if output.is_dir() and any(output.iterdir()):
-        if overwrite:
+        if overwrite or (resume and begun is not None and parts):  # what goes on may have been begun by --overwrite
             check_apart(output, inputs)
             check_replaceable(output, verb)
         elif resume:
@@ -301,7 +304,6 @@ def _begun(
         else:
             choices = "give --overwrite" if resume is None else "give --resume or --overwrite"
             raise InputError(output, "already there and not empty", f"choose another -o, or {choices}")
-    begun, parts = begun_with(made), finished_parts(made)
     if begun is not None and parts and not overwrite:
         if not resume:
             cure = f"--overwrite starts anew, and {begun['verb']} --resume goes on"
@@ -313,15 +315,19 @@ def _begun(
         if resume:
             print("nothing to resume: starting anew", flush=True)
     try_place(output)
-    if parts:
-        clean(made, parts)
-        run = Run(made, output, verb, arguments, parts)
-        run.log(f"resumed: {len(parts)} finished part(s) are kept")
-        return run
-    made.mkdir(mode=0o700)
-    made.chmod(0o700)  # until it is finished its files name the inputs
-    begin(made, {"verb": verb, "arguments": compared(arguments), "inputs": {}})
-    return Run(made, output, verb, arguments, {} if resume is not None else None)
+    return parts
+
+
+def _begin(run: Run) -> None:
+    """Its folder is made, or freed of what no finished part has."""
+    if run.parts:
+        clean(run.folder, run.parts)
+        run.log(f"resumed: {len(run.parts)} finished part(s) are kept")
+        return
+    run.folder.mkdir(mode=0o700)
+    special = stat.S_IMODE(run.folder.stat().st_mode) & ~0o777  # a folder of a group hands its group on
+    run.folder.chmod(special | 0o700)  # until it is finished its files name the inputs
+    run.begin()
 
 
 @contextmanager
@@ -336,7 +342,8 @@ def _kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
             error, run.folder, said or f"Nothing of it is kept; {output.name} is as it was", output
         )
         if not kept:
-            discard(run.folder)
+            with finishing_first():
+                discard(run.folder)
         elif failure is None:
             error.add_note(said)
             if hasattr(error, "kept"):  # a signal, which is told with it

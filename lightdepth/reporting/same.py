@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, is_dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from lightdepth.errors import AlreadyFinished, InputError
 from lightdepth.files.below import files_below
 from lightdepth.files.named_inputs import INPUTS, TOKEN, with_real_inputs
 from lightdepth.files.replacing import read_record
+from lightdepth.regular import regular
 
 
 def check_finished(output: Path, verb: str, arguments: Mapping[str, Any]) -> None:
@@ -29,6 +31,9 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
     """Raises InputError, naming what differs, unless this is the run that was begun there."""
     if begun["verb"] != verb:
         raise InputError(output, f"not resumed, it is of {begun['verb']}, not of {verb}", "choose another -o")
+    if (version := begun.get("version", own_version())) != own_version():
+        found = f"not resumed, it was begun by version {version}, and this is {own_version()}"
+        raise InputError(output, found, "go on with that version, or give --overwrite to start anew")
     now, then = compared(arguments), compared(begun.get("arguments") or {})
     for name in dict.fromkeys([*now, *then]):
         if now.get(name) != then.get(name):
@@ -38,9 +43,19 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
             found = f"not resumed, --{name.replace('_', '-')} was {then.get(name)!r} and is {now.get(name)!r}"
             raise InputError(output, found, "give the same options, or --overwrite to start anew")
     for name, known in (begun.get("inputs") or {}).items():
+        if not isinstance(known, Mapping):
+            continue  # a training's: it has no more than their hashes
         path = Path(str(arguments.get(name) or known.get("path") or ""))
         if "sha256" in known and not (path.exists() and input_hash(path, output) == known["sha256"]):
             raise InputError(output, f"not resumed, {name} has changed since", "--overwrite starts anew")
+
+
+def own_version() -> str:
+    """The version of the program: another one may make other files of the same inputs."""
+    try:
+        return metadata.version("lightdepth")
+    except metadata.PackageNotFoundError:  # read from its sources
+        return ""
 
 
 _NOT_COMPARED = ("output", "overwrite", "resume", "keep_names")
@@ -75,7 +90,7 @@ def input_hash(path: Path, without: Path | None = None) -> str:
     if not path.exists():
         raise InputError(path, "no such file or folder", "correct its name, or put it there")
     digest = hashlib.sha256()
-    files = files_below(path, without) if path.is_dir() else [path]
+    files = files_below(path, without) if path.is_dir() else [regular(path)]
     read = 1 << 20 if path.is_dir() else 1 << 30
     for file in files:
         size = file.stat().st_size

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lightdepth.files.replacing import BEGUN, PARTS
+from lightdepth.files.replacing import BEGUN, PARTS, below
 from lightdepth.files.writing import sync, write_whole
 
 LOG = "log.txt"
@@ -39,11 +39,17 @@ def begin(folder: Path, begun: Mapping[str, Any]) -> None:
 
 def begun_with(folder: Path) -> dict[str, Any] | None:
     """What an unfinished run was begun with, or None where there is none that can be resumed."""
+    if not (folder / BEGUN).is_file():
+        return None
     try:
         found = json.loads((folder / BEGUN).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    return found if isinstance(found, dict) and isinstance(found.get("verb"), str) else None
+    if not (isinstance(found, dict) and isinstance(found.get("verb"), str)):
+        return None
+    groups = [found.get("arguments") or {}, found.get("inputs") or {}]
+    whole = all(isinstance(group, dict) for group in groups) and all(isinstance(v, dict) for v in groups[1].values())
+    return found if whole else None
 
 
 def add_part(folder: Path, part: Part, files: Iterable[Path]) -> None:
@@ -61,7 +67,10 @@ def add_part(folder: Path, part: Part, files: Iterable[Path]) -> None:
 
 
 def finished_parts(folder: Path) -> dict[str, Part]:
-    """The finished parts whose files are all there, by name, in the order in which they were finished."""
+    """The finished parts whose files are all there, by name, in the order in which they were finished. None where a
+    link is among the files, which no run makes: what goes on would write to where it leads."""
+    if any(path.is_symlink() for path in below(folder)):
+        return {}
     try:
         lines = (folder / PARTS).read_text(encoding="utf-8", errors="surrogateescape").split("\n")
     except OSError:
@@ -70,16 +79,16 @@ def finished_parts(folder: Path) -> dict[str, Part]:
     for line in lines[:-1]:  # what follows the last end of a line is torn
         try:
             part = Part(**json.loads(line))
-        except (ValueError, TypeError, RecursionError):
+            if all(_size(folder / name) == size for name, size in part.files.items()):
+                parts[part.name] = part
+        except (ValueError, TypeError, AttributeError, RecursionError):
             continue
-        if all(_size(folder / name) == size for name, size in part.files.items()):
-            parts[part.name] = part
     return parts
 
 
 def clean(folder: Path, parts: Mapping[str, Part]) -> None:
     """Removes what belongs to no finished part, so that the rest is made as if for the first time."""
-    ours = {name for part in parts.values() for name in part.files} | {BEGUN, LOG}
+    ours = {name for part in parts.values() for name in part.files} | {BEGUN, PARTS, LOG}
     for place, _, names in os.walk(folder, topdown=False):
         for name in names:
             path = Path(place) / name

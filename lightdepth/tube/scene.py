@@ -26,9 +26,9 @@ from torch import Tensor
 
 from lightdepth.camera import CameraModel
 from lightdepth.photometry import LightTerms, PhotometricCalibration, irradiance
-from lightdepth.radiosity import form_factors
 from lightdepth.ranges import SHARE, at_least, checked
 from lightdepth.tube.casting import Caster, EmbreeCaster, make_caster
+from lightdepth.tube.exchange import ExchangeConfig, Patches, draw_exchange, exchanged
 from lightdepth.tube.film import FilmConfig, cover, fine_relief
 from lightdepth.tube.path import PathConfig, image_flow
 from lightdepth.tube.polyps import tinted
@@ -55,6 +55,8 @@ class TubeConfig:
     patch: Annotated[float, at_least(0.2, up_to=1000)] = 3.5
     """Length along the tube, mm, of the patches of wall between which light is thrown to and fro. A larger one makes
     coarser indirect light, sooner."""
+    exchange: ExchangeConfig = field(default_factory=ExchangeConfig)
+    """How light between patches of wall is reckoned."""
     least_cosine: Annotated[float, SHARE] = 0.0
     """Least cosine between the wall's normal, interpolated over its mesh, and the direction to the camera; normals
     turned farther away, at the edges of folds, are turned back to it. A larger one turns more of them; 0 leaves all as
@@ -180,7 +182,8 @@ class Tube:
         self._paint, self._bumps, self._normals = map(self._map, (self.albedo, bumps, self.shape.normals))
         self._wet = None if self.film.wet is None else self._map(self.film.wet)
         self._domes = None if self.film.slopes is None else self._map(self.film.slopes)
-        self._patches = self._make_patches()
+        self._exchange = draw_exchange(config.exchange, rng)
+        self._patches, self._factors, self._tint = self._make_patches()
 
     _make_shape = staticmethod(make_shape)
     _make_texture = staticmethod(make_texture)
@@ -192,7 +195,7 @@ class Tube:
         vars(other).pop("_on_cpu", None)
         other.shape, other._normals = shape, self._map(shape.normals)
         other._caster = make_caster(shape.vertices.reshape(-1, 3), shape.faces, self.device)
-        other._patches = other._make_patches()
+        other._patches, other._factors, other._tint = other._make_patches()
         return other
 
     def view(
@@ -304,8 +307,10 @@ class Tube:
         parts = t[:, None, None], normals[:, :, None], rays[:, :, None]
         return irradiance(*parts, light, self.cosine_exponent)[:, 0, 0]
 
-    def _make_patches(self) -> _Patches:
-        n_s, n_phi = max(8, round(len(self.shape.vertices) * self.shape.step / self._patch)), 22
+    def _make_patches(self) -> tuple[Patches, Tensor, Tensor]:
+        """The patches, their form factors, and the share of each colour (N, 3) that they throw back."""
+        mesh, size = self.shape.vertices.shape[:2], self._patch * self._exchange.coarser
+        n_s, n_phi = max(8, round(mesh[0] * self.shape.step / size)), max(8, round(22 / self._exchange.coarser))
         # Each (s, phi) of the coarse grid once: the column at the seam is the first again.
         phi, s = np.meshgrid(np.arange(n_phi) * 2 / n_phi - 1, np.linspace(-1, 1, n_s))
         place = self._tensor(np.stack([phi, s], -1).reshape(1, -1, 2))
@@ -315,14 +320,10 @@ class Tube:
         along_s = torch.gradient(grid, dim=0)[0]
         wrapped = torch.cat([grid[:, -1:], grid, grid[:, :1]], 1)
         areas = torch.linalg.cross(along_s, (wrapped[:, 2:] - wrapped[:, :-2]) / 2).norm(dim=-1).flatten()
-        factors = form_factors(points[None], normals[None], areas[None])[0]
-        # A patch cannot light what it does not see.
-        i, j = torch.nonzero((factors + factors.T).triu() > 1e-6).unbind(-1)
-        lifted = points + 0.4 * normals
-        blocked = self._caster.blocked(lifted[i], lifted[j]).to(self.device)
-        factors[i[blocked], j[blocked]] = factors[j[blocked], i[blocked]] = 0
+        patches = Patches((n_s, n_phi), points, normals, areas)
         mean_albedo = cv2.resize(self.albedo, (n_phi, n_s), interpolation=cv2.INTER_AREA).reshape(-1, 3)
-        return _Patches((n_s, n_phi), points, normals, lifted, factors, self._tensor(mean_albedo))
+        tint = self.light.reflectance * self._tensor(mean_albedo)
+        return patches, exchanged(self._exchange.form, patches, self._caster, mesh), tint
 
     def _indirect(self, cam_from_world: Tensor, origin: Tensor) -> WallMap:
         """Light from the wall on every patch: rho K E summed over the bounces, per view and colour."""
@@ -336,22 +337,11 @@ class Tube:
         dark = self._caster.blocked(lamp.mT.expand_as(ends).reshape(-1, 3), ends.reshape(-1, 3)).to(self.device)
         direct = self._direct(t, cam_from_world @ patches.normals.T, in_cam / t[:, None])
         source = (direct * ~dark.reshape(count, -1))[..., None]
-        tint = self.light.reflectance * patches.albedo
         total = source
-        for _ in range(6):
-            bounced = patches.factors @ (tint * total)
+        for _ in range(self._exchange.bounces):
+            bounced = self._factors @ (self._tint * total)
             total = source + bounced
         return WallMap.of(bounced.reshape(count, *patches.grid, 3))
-
-
-@dataclass(frozen=True)
-class _Patches:
-    grid: tuple[int, int]  # (n_s, n_phi)
-    points: Tensor
-    normals: Tensor
-    lifted: Tensor
-    factors: Tensor
-    albedo: Tensor
 
 
 def _unit(vectors: Tensor) -> Tensor:

@@ -1,4 +1,5 @@
-"""Colons of another make, to judge networks on what they never trained on. Nothing here may be trained or tuned on.
+"""Colons of another make, to judge networks on what they never trained on. No distance may be learnt or chosen on them;
+the size of an uncertainty may be set on those of --data.tube.val-family variant, seeds 1,000,000 and up.
 
 Other shape (cross-sections that are splines through uneven knots, folds that are arcs with one steep side), other
 paint (cells of a Voronoi diagram with a network between them), other light (three lamps beside the lens, each fading as

@@ -14,7 +14,7 @@ from lightdepth.losses import LossConfig
 from lightdepth.tube.path import Lens
 
 from ..card import Card
-from ..colons import TubeData
+from ..colons import Family, TubeData
 from .judging import Verdict
 
 _MAX_FRAMES, _MAX_TRAVEL_MM = 1000, 10_000.0
@@ -109,7 +109,7 @@ def _drawable(name: str, value: object) -> bool:
     if name == "travel":
         return isinstance(value, int | float) and 0 <= value <= _MAX_TRAVEL_MM
     if name == "family":
-        return value in ("plain", "realistic", "mixed")
+        return value in get_args(Family)
     if name == "lenses":
         return isinstance(value, tuple) and 0 < len(value) <= 100 and all(one in get_args(Lens) for one in value)
     numbers = value if isinstance(value, tuple) and len(value) == 2 else ()

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import lightning.pytorch as pl
 import numpy as np
 
 from lightdepth.datasets import FrameSequence
@@ -23,6 +22,7 @@ from lightdepth.module import MIN_RAY_Z
 from lightdepth.reporting.report import number
 
 from ..datamodule import FrameDataModule, held_out_count
+from ..running import trainer_of_one
 from .module import Adaptation
 from .wall_judge import WallErrors, WallJudge, compared
 
@@ -214,14 +214,7 @@ def judged(
 ) -> Judgement:
     """Errors of the module on the validation frames, and of the model, the same network, against truth and at the
     map's blocks."""
-    trainer = pl.Trainer(
-        devices=1,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
-    found = trainer.validate(module, datamodule=data, verbose=False)[0]
+    found = trainer_of_one().validate(module, datamodule=data, verbose=False)[0]
     errors = {name.removeprefix("val/"): float(value) for name, value in found.items()}
     model.network.eval()
     return replace(looked_at(model, held, wall), errors=errors)

@@ -13,10 +13,9 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import lightning.pytorch as pl
 from safetensors.torch import load_file, save_file
 
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model, save_model
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called, save_model
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.detective import PairingConfig
@@ -36,7 +35,7 @@ from ..adapting.target import Target, adaptation, frame_data, read_target, repla
 from ..adapting.wall_judge import compared, wall_judge
 from ..callbacks import Diagnosis, DiagnosisConfig, TrainingProgress
 from ..datamodule import FrameDataModule
-from ..running import quiet, report_every
+from ..running import quiet, report_every, trainer_of_one
 
 
 def adapt(
@@ -92,7 +91,7 @@ def adapt(
         sfm=sfm,
         keep_worse=keep_worse,
     )
-    start = load_model(checkpoint, details=False)
+    start = load_called(checkpoint, details=False)
     if not isinstance(start, NetworkModel):
         raise InputError("--checkpoint", f"{checkpoint} has no weights to adapt", "expected a trained checkpoint")
     quiet()
@@ -140,18 +139,8 @@ def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> Non
     if run.done("training"):
         module.network.load_state_dict(load_file(run.state / "trained.safetensors"))
         return
-    trainer = pl.Trainer(
-        devices=1,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        max_steps=steps,
-        gradient_clip_val=1.0,
-        limit_val_batches=0,
-        log_every_n_steps=1,
-        callbacks=[Diagnosis(DiagnosisConfig(), data.names), TrainingProgress(run.log, report_every(steps))],
-    )
+    told = [Diagnosis(DiagnosisConfig(), data.names), TrainingProgress(run.log, report_every(steps))]
+    trainer = trainer_of_one(steps, told)
     trainer.fit(module, datamodule=data)
     if run.resumable:
         run.state.mkdir(exist_ok=True)

@@ -1,0 +1,146 @@
+"""What strangers put where a run keeps its own files: links, pipes, files of other programs, records that are none."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from pathlib import Path
+
+import pytest
+from raising import refused
+
+from lightdepth.files.lock import is_live, lock_path
+from lightdepth.files.replacing import BEGUN, PARTS, RECORD, old_path, read_record, remains, unfinished_path
+from lightdepth.reporting.run import run_folder
+
+
+def make(output: Path, arguments=None, **given) -> None:
+    with run_folder(output, "densify", arguments or {"seed": 3}, **given) as run:
+        (run.folder / "result.txt").write_text("new")
+
+
+def stop(output: Path) -> Path:
+    """A run that was stopped after its first part; its hidden folder."""
+    with pytest.raises(KeyboardInterrupt), run_folder(output, "densify", {"seed": 3}, resume=False) as run:
+        (run.folder / "maps").mkdir()
+        (run.folder / "maps" / "one.txt").write_text("one")
+        run.finish_part("one")
+        raise KeyboardInterrupt
+    return unfinished_path(output)
+
+
+def test_a_link_in_the_place_of_the_lock_is_not_written_through(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    lock_path(tmp_path / "out").symlink_to("thesis.txt")
+    with refused("in the way", "not made by this program", cure="another -o"):
+        make(tmp_path / "out")
+    assert (tmp_path / "thesis.txt").read_text() == "mine" and lock_path(tmp_path / "out").is_symlink()
+
+
+@pytest.mark.parametrize("text", ["mine", "[1]", '{"host": "here"}'])
+def test_a_file_of_another_program_with_the_name_of_a_lock_is_left_alone(tmp_path, text):
+    lock_path(tmp_path / "out").write_text(text)
+    with refused("in the way", "not made by this program", cure="another -o"):
+        make(tmp_path / "out")
+    assert lock_path(tmp_path / "out").read_text() == text and not list(remains(tmp_path))
+
+
+@pytest.mark.parametrize("text", ["", "\0" * 90])
+def test_a_lock_that_a_power_cut_left_without_words_is_taken_over(tmp_path, text):
+    lock_path(tmp_path / "out").write_text(text)
+    make(tmp_path / "out")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
+
+
+@pytest.mark.parametrize("hidden", [old_path, unfinished_path])
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_link_in_the_place_of_a_hidden_folder_costs_nothing_where_it_leads(tmp_path, hidden, ours):
+    make(tmp_path / "elsewhere" / "precious")
+    if not ours:
+        (tmp_path / "elsewhere" / "precious" / RECORD).rename(tmp_path / "elsewhere" / "precious" / BEGUN)
+    before = sorted((tmp_path / "elsewhere").rglob("*"))
+    hidden(tmp_path / "out").symlink_to("elsewhere/precious")
+    for given in ({}, {"overwrite": True}, {"resume": True}):
+        with refused("in the way", "not made by this program"):
+            make(tmp_path / "out", **given)
+    assert sorted((tmp_path / "elsewhere").rglob("*")) == before and not list(remains(tmp_path))
+
+
+def test_an_unfinished_run_with_a_link_in_it_is_begun_anew_and_nothing_is_written_where_it_leads(tmp_path):
+    made = stop(tmp_path / "out")
+    (made / "maps" / "one.txt").unlink()
+    (made / "maps").rmdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "one.txt").write_text("one")
+    (made / "maps").symlink_to(tmp_path / "elsewhere")
+    with run_folder(tmp_path / "out", "densify", {"seed": 3}, resume=True) as run:
+        assert not run.resumed and not (run.folder / "maps").exists()
+    assert (tmp_path / "elsewhere" / "one.txt").read_text() == "one"
+
+
+@pytest.mark.parametrize("line", ['{"name": "x", "files": [1]}', '{"name": "x", "files": {"a\\u0000": 1}}', "[]", "7"])
+def test_a_line_that_tells_of_no_part_counts_as_not_written(tmp_path, line):
+    made = stop(tmp_path / "out")
+    with (made / PARTS).open("a") as file:
+        file.write(line + "\n")
+    with run_folder(tmp_path / "out", "densify", {"seed": 3}, resume=True) as run:
+        assert list(run.parts or ()) == ["one"]
+
+
+def test_a_run_that_another_version_began_is_not_gone_on_with(tmp_path):
+    begun = stop(tmp_path / "out") / BEGUN
+    begun.write_text(json.dumps(json.loads(begun.read_text()) | {"version": "0.0.1"}))
+    with refused("begun by version 0.0.1", cure="--overwrite"):
+        make(tmp_path / "out", resume=True)
+    make(tmp_path / "out", overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "\ud800", "x" * 5000, "/etc/passwd", "."])
+def test_a_list_of_files_with_what_is_no_name_of_a_file_is_read_without_harm(tmp_path, name):
+    make(tmp_path / "out")
+    record = json.loads((tmp_path / "out" / RECORD).read_text())
+    record["files"][name] = 4096
+    (tmp_path / "out" / RECORD).write_text(json.dumps(record))
+    make(tmp_path / "out", overwrite=True)
+
+
+@pytest.mark.parametrize("change", [{"arguments": [1]}, {"inputs": [2]}, {"inputs": {"data": 3}}, {"versions": 1}])
+def test_a_run_json_of_other_kinds_than_ours_is_none(tmp_path, change):
+    make(tmp_path / "out")
+    record = json.loads((tmp_path / "out" / RECORD).read_text())
+    (tmp_path / "out" / RECORD).write_text(json.dumps(record | change))
+    assert read_record(tmp_path / "out") is None
+    for given in ({"resume": True}, {"overwrite": True}):
+        with refused(cure="choose another -o"):
+            make(tmp_path / "out", **given)
+
+
+def test_pipes_with_our_names_are_not_waited_for(tmp_path):
+    made = stop(tmp_path / "out")
+    (made / BEGUN).unlink()
+    os.mkfifo(made / BEGUN)
+    os.mkfifo(made / RECORD)
+    os.mkfifo(lock_path(tmp_path / "other"))
+    assert not is_live(tmp_path / "other") and not list(remains(tmp_path))
+    with refused("in the way"):
+        make(tmp_path / "out", resume=True)
+
+
+def test_an_input_that_gives_without_end_or_never_is_not_read_to_its_end(tmp_path):
+    os.mkfifo(tmp_path / "camera.json")
+    for path, kind in ((Path("/dev/zero"), "a device"), (tmp_path / "camera.json", "a named pipe")):
+        with refused(kind, "not a file"), run_folder(tmp_path / "out", "densify", {}) as run:
+            run.hash_inputs(mask=path)
+
+
+@pytest.mark.parametrize("umask", [0o077, 0o027, 0o002])
+def test_who_may_read_a_result_is_as_the_umask_and_the_folder_s_group_say(tmp_path, umask):
+    (tmp_path / "shared").mkdir()
+    (tmp_path / "shared").chmod(0o2775)
+    before = os.umask(umask)
+    try:
+        make(tmp_path / "shared" / "out")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "shared" / "out").stat().st_mode) == 0o2777 & ~umask
