@@ -144,10 +144,13 @@ def test_an_interrupted_run_goes_on_with_the_row_that_it_was_at(tmp_path, cheap,
 def test_the_rows_of_a_seed_share_its_colons(tmp_path, cheap, monkeypatch):
     import train.datamodule as datamodule
 
-    drawn, real = [], datamodule.tube_scene
-    monkeypatch.setattr(
-        datamodule, "tube_scene", lambda tube, seed, *rest: drawn.append(seed) or real(tube, seed, *rest)
-    )
+    drawn = []
+
+    def noted(real):
+        return lambda tube, seed, *rest: drawn.append(seed) or real(tube, seed, *rest)
+
+    for name in ("tube_scene", "val_scene"):
+        monkeypatch.setattr(datamodule, name, noted(getattr(datamodule, name)))
     other = Row("other colons", settings={"data.tube.family": "realistic"}, seeds=(3,))
     run(tmp_path / "run", rows=(*ROWS, other), seeds=(3, 4))
     assert drawn == [30000, 1030000] * 2 + [40000, 1040000]
