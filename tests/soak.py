@@ -483,6 +483,7 @@ def main() -> int:
     parse.add_argument("--sequences", type=int, default=200, help="one after the other; 0 for none")
     asked = parse.parse_args()
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     began, processor = time.monotonic(), time.process_time()
     rows, wrong = soaked(asked.keyframes, asked.sequences)
     print(HEADER)
