@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 from lightdepth import __version__
 from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.command_line.pipes import fill_closed_streams, outliving_readers
-from lightdepth.command_line.signals import ending_on_signals
 from lightdepth.command_line.warned import warnings_as_sentences
 from lightdepth.errors import (
     AlreadyFinished,
@@ -37,6 +36,7 @@ from lightdepth.errors import (
     MissingOption,
     PartialFailure,
 )
+from lightdepth.signals import ending_on_signals
 
 GROUP = "lightdepth.commands"
 KEEP_NAMES = """Write the paths of inputs as they are into run.json, log and reports. Without it they are called by the

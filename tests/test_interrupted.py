@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from lightdepth.command_line.signals import ending_on_signals
 from lightdepth.errors import AlreadyFinished, InputError, Interrupted
 from lightdepth.files.replacing import check_files, discard, old_path, unfinished_path
 from lightdepth.files.writing import write_together
 from lightdepth.reporting import run as reporting
 from lightdepth.reporting.run import run_folder
 from lightdepth.reporting.unfinished import Part, add_part, clean, finished_parts
+from lightdepth.signals import ending_on_signals
 
 CHANGING = ("rename", "replace", "unlink", "rmdir", "mkdir")
 

@@ -20,8 +20,8 @@ from training import write_sequence
 
 import train.fit as fit_module
 from lightdepth.checkpoint import read_card
-from lightdepth.command_line.signals import ending_on_signals
 from lightdepth.errors import Interrupted
+from lightdepth.signals import ending_on_signals
 from train.checkpoints import WholeCheckpoints, clear_cut_off, newest
 from train.commands.train import train
 from train.requeue import requeued

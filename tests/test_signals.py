@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 
 import lightdepth.cli as cli
-from lightdepth.command_line.signals import SIGNALS, ending_on_signals, finishing_first
 from lightdepth.errors import Interrupted
 from lightdepth.reporting.run import run_folder
+from lightdepth.signals import SIGNALS, ending_on_signals, finishing_first
 
 
 @pytest.fixture(autouse=True)

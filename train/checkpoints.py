@@ -23,10 +23,10 @@ from lightning.pytorch.callbacks import EarlyStopping
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from lightdepth.checkpoint import load_model
-from lightdepth.command_line.signals import Received
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.weights import read_pickled
 from lightdepth.files.writing import is_dead_partial, write_whole
+from lightdepth.signals import Received
 
 LAST, PREVIOUS, BEST = "last.ckpt", "last-previous.ckpt", "best.ckpt"
 _SEEDS_APART = 1_000_003

@@ -22,7 +22,6 @@ import yaml
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from lightdepth.checkpoint import load_model, save_model
-from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError, Interrupted
 from lightdepth.files.named_inputs import write_inputs
 from lightdepth.files.replacing import output_of, read_record, unfinished_path
@@ -33,6 +32,7 @@ from lightdepth.network import DepthNetwork
 from lightdepth.reporting.names import KEPT, Names, names_of
 from lightdepth.reporting.record import versions, write_run_json
 from lightdepth.reporting.run import input_hash
+from lightdepth.signals import finishing_first
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
 from .callbacks import validation_line

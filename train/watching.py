@@ -12,10 +12,10 @@ import lightning.pytorch as pl
 from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging, LearningRateMonitor, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
-from lightdepth.command_line.signals import Received
 from lightdepth.errors import InputError
 from lightdepth.ranges import BELOW_ONE, at_least, checked
 from lightdepth.reporting.names import Names
+from lightdepth.signals import Received
 
 from .callbacks import Diagnosis, DiagnosisConfig, Panels, TrainingProgress
 from .checkpoints import Checkpoints, Start, WholeCheckpoints

@@ -17,8 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError
+from lightdepth.signals import finishing_first
 
 _LOCK = {"host", "pid", "time"}
 """What a lock of ours says at least."""

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError
 from lightdepth.files.lock import is_live, is_lock, lock_path
 from lightdepth.files.writing import PARTIAL, check_writable, is_dead_partial, move_whole, sync, sync_below
+from lightdepth.signals import finishing_first
 
 RECORD = "run.json"
 """The file that says that a folder is the whole result of a run, of which verb, and which files are the run's."""

@@ -17,9 +17,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError
 from lightdepth.files.machine import FAILS
+from lightdepth.signals import finishing_first
 
 Content = str | bytes | Callable[[Path], object]
 """Text, bytes, or a function that writes a file at the path that it is given (the ending is that of the real one)."""

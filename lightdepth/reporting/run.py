@@ -15,7 +15,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from lightdepth.command_line.signals import finishing_first
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.lock import locked
 from lightdepth.files.machine import machine_failure
@@ -49,6 +48,7 @@ from lightdepth.reporting.unfinished import (
     finished_parts,
     new_files,
 )
+from lightdepth.signals import finishing_first
 
 
 class Run:
