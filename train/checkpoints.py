@@ -29,6 +29,7 @@ from lightdepth.files.writing import is_dead_partial, write_whole
 from lightdepth.signals import Received
 
 LAST, PREVIOUS, BEST = "last.ckpt", "last-previous.ckpt", "best.ckpt"
+NOT_KEPT = "the last one is not kept"
 _SEEDS_APART = 1_000_003
 _STARTS_ANEW = "remove it to start anew, or copy it again"
 
@@ -85,14 +86,15 @@ def _start(path: Path) -> Start:
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Writes a checkpoint beside its place, brings it to the disk and renames it; keeps the last one before it."""
+    """Writes a checkpoint beside its place, brings it to the disk and renames it; keeps the last one before it, unless
+    the storage options are NOT_KEPT."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, object], path: str | Path, storage_options: object | None = None
     ) -> None:
-        assert storage_options is None, storage_options
+        assert storage_options in (None, NOT_KEPT), storage_options
         path = Path(path)
-        if path.name == LAST and path.is_file():
+        if path.name == LAST and path.is_file() and storage_options != NOT_KEPT:
             _keep(path, path.with_name(PREVIOUS))
         write_whole(path, lambda partial: torch.save(checkpoint, partial))
 
@@ -119,7 +121,8 @@ def clear_cut_off(folder: Path) -> None:
 
 class Checkpoints(pl.Callback):
     """Writes `best` after a validation and `last` between two steps: every `every` of them, at the end, where the run
-    is stopped by a signal, and where it ends with a diagnosis.
+    is stopped by a signal, and where it ends with a diagnosis. A `last` from where a run was stopped is not kept beside
+    the next one: `last-previous` is of the same step as without the stop.
 
     `monitor` is the metric that is least in `best`; None writes no best. `received` holds a signal back until a step is
     whole; `resumed` is the number of steps that the run had when it was resumed.
@@ -133,6 +136,7 @@ class Checkpoints(pl.Callback):
         self._best, self._best_batches = math.inf, 0
         self._planned = math.nan
         self._saved = resumed.step if resumed is not None else 0
+        self._between = resumed is not None and resumed.path.name == LAST and resumed.step % every != 0
 
     def state_dict(self) -> dict[str, object]:
         return {"best": self._best, "best_batches": self._best_batches, "planned": self._planned}
@@ -181,7 +185,7 @@ class Checkpoints(pl.Callback):
         if trainer.world_size > 1:
             stop = trainer.strategy.reduce_boolean_decision(stop, all=False)
         if step and step != self._saved and (stop or step % self.every == 0):
-            self._save(trainer, LAST)
+            self._save(trainer)
         if stop:
             kept = f"step {step} is kept in {LAST}: --resume goes on" if step else "no step was made yet"
             self.received.signal = self.received.signal or signal.SIGTERM  # another process was told
@@ -197,7 +201,7 @@ class Checkpoints(pl.Callback):
             trainer.save_checkpoint(self.folder / BEST)
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        self._save(trainer, LAST)
+        self._save(trainer)
 
     def on_exception(self, trainer: pl.Trainer, module: pl.LightningModule, exception: BaseException) -> None:
         """Between two steps it is as good a place as any; within one, or before its validation, it is none. A run that
@@ -207,11 +211,12 @@ class Checkpoints(pl.Callback):
         whole = total.started == total.processed and (total.processed == total.completed or diagnosed)
         new = trainer.global_step not in (0, self._saved)
         if new and trainer.training and whole and not _gradient_waits(trainer):
-            self._save(trainer, LAST)
+            self._save(trainer)
 
-    def _save(self, trainer: pl.Trainer, name: str) -> None:
+    def _save(self, trainer: pl.Trainer) -> None:
         self._saved = trainer.global_step
-        trainer.save_checkpoint(self.folder / name)
+        trainer.save_checkpoint(self.folder / LAST, storage_options=NOT_KEPT if self._between else None)
+        self._between = False
 
 
 def _done(trainer: pl.Trainer) -> Any:
