@@ -1,10 +1,16 @@
+import functools
 import os
 from pathlib import Path
 
 import pytest
 import torch
+from docstring_parser import attrdoc
 
 torch.set_num_threads(1)
+
+# Each run of a verb in this process reads the sentences of its options from the sources anew; once is enough here.
+_read = functools.cache(functools.partial(attrdoc.AttributeDocstrings.get_attr_docs, attrdoc.AttributeDocstrings()))
+attrdoc.AttributeDocstrings.get_attr_docs = lambda self, component: _read(component)
 
 
 @pytest.fixture(scope="session")
