@@ -7,7 +7,6 @@ folder with its deviation, and said.
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from lightdepth.camera import CameraModel, camera_from_params
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.reading import size_of_frames
 from lightdepth.errors import InputError
+from lightdepth.files.working import working_folder
 from lightdepth.reporting.run import Run
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.self_calibration import SelfCalibration, across, self_calibrated
@@ -106,9 +106,9 @@ def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = No
     """The camera of the source's frames with how sure it is, or the one of its field of view where they do not
     connect. Said in the run."""
     width, height = size_of_frames(source.data, source.format)
-    with tempfile.TemporaryDirectory(prefix="stand-in-") as folder, warnings.catch_warnings():
+    with working_folder() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the frames are opened again, under the camera that is found
-        stand_in = Path(folder) / "camera.json"
+        stand_in = folder / "camera.json"
         write_camera(across(width, height, source.fov or 70.0), stand_in)
         frames = replace(source, camera=stand_in, fov=None).open().without_truth()
         try:

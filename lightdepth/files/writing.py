@@ -151,7 +151,12 @@ def sync(path: Path) -> None:
 
 def is_dead_partial(path: Path) -> bool:
     """Whether a file is what a process of this machine, which is dead, had written of one."""
-    found = re.fullmatch(rf"{re.escape(PARTIAL)}([0-9a-f]{{8}})-(\d{{1,9}})-.*", path.name, re.DOTALL)
+    return is_of_the_dead(path.name, PARTIAL)
+
+
+def is_of_the_dead(name: str, beginning: str) -> bool:
+    """Whether a name is that beginning, the `our_mark` of a process of this machine that is dead, and more."""
+    found = re.fullmatch(rf"{re.escape(beginning)}([0-9a-f]{{8}})-(\d{{1,9}})-.*", name, re.DOTALL)
     if found is None or found[1] != _machine():
         return False
     try:
@@ -163,9 +168,14 @@ def is_dead_partial(path: Path) -> bool:
     return False
 
 
+def our_mark() -> str:
+    """What says in a name whose it is: this machine and this process."""
+    return f"{_machine()}-{os.getpid()}-"
+
+
 def _partial(path: Path) -> Path:
     """A name beside a file for what is written of it, with its ending, of this process alone."""
-    return path.with_name(f"{PARTIAL}{_machine()}-{os.getpid()}-{_ending(path)}")
+    return path.with_name(f"{PARTIAL}{our_mark()}{_ending(path)}")
 
 
 def _ending(path: Path) -> str:

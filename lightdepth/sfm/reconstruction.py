@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import logging
 import shutil
-import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,6 +25,7 @@ import numpy as np
 from lightdepth.camera import CameraModel, KannalaBrandt, Scaramuzza
 from lightdepth.camera_conversion import Conversion, convert_camera
 from lightdepth.errors import InputError
+from lightdepth.files.working import working_folder
 from lightdepth.frame import Frame, frame_number
 from lightdepth.maps import read_map
 from lightdepth.maps.colmap import holds_model
@@ -76,24 +76,24 @@ def sparse_map_from_frames(
     check_free(out_folder)
     # On the target's disk, so that the finished models arrive by a rename.
     existing = next(p for p in out_folder.resolve().parents if p.is_dir())
-    with tempfile.TemporaryDirectory(prefix=".sfm-", dir=existing) as work:
-        images, masks, models = (Path(work) / part for part in ("images", "masks", "models"))
+    with working_folder(existing) as work:
+        images, masks, models = (work / part for part in ("images", "masks", "models"))
         for folder in (images, masks, models):
             folder.mkdir()
         written = write_images(frames, images, masks, config, progress)
         fit = fisheye_fit(written.camera, written.valid) if isinstance(written.camera, Scaramuzza) else None
         camera, names = fit.camera if fit else written.camera, sorted(written.names)
         known = None if poses is None else _known_poses(poses, written.names)
-        matching = features_and_matches(Path(work), camera, names, config, progress, database)
+        matching = features_and_matches(work, camera, names, config, progress, database)
         fitting = None
         if known is None:
-            count = mapped(Path(work), names, config, progress)
+            count = mapped(work, names, config, progress)
         else:
-            fitting = fitting_poses(far_matches(Path(work), sorted(known), _JUDGED), known, camera, turn_of(fit))
+            fitting = fitting_poses(far_matches(work, sorted(known), _JUDGED), known, camera, turn_of(fit))
             if fitting.poor:
                 warnings.warn(f"known poses: only {fitting}: are they the poses of these frames?", stacklevel=2)
             at = {name: turn_of(fit) @ np.linalg.inv(pose) for name, pose in known.items()}
-            count = _triangulated(Path(work), at, config, progress)
+            count = _triangulated(work, at, config, progress)
         submaps = read_map(models).submaps if count else ()
         if fit:
             submaps = tuple(with_camera(s, written.camera, fit.rotation) for s in submaps)

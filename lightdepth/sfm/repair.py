@@ -12,7 +12,6 @@ With sfm.features, sfm.mapping and sfm.reconstruction the only module that uses 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from lightdepth.camera import Scaramuzza
+from lightdepth.files.working import working_folder
 from lightdepth.frame import Frame
 from lightdepth.maps import write_text_model
 from lightdepth.maps.colmap import read_submap
@@ -102,8 +102,7 @@ def repaired_submap(
         reason = f"{len(frames)} of its {len(submap.keyframes)} keyframes have a frame"
         return _as_it_was(submap, out_folder, reason)
     out_folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".repair-", dir=out_folder.parent) as folder:
-        work = Path(folder)
+    with working_folder(out_folder.parent) as work:
         for part in ("images", "masks", "colmap", "mapping", "model"):
             (work / part).mkdir()
         written = write_images(frames, work / "images", work / "masks", config, progress)

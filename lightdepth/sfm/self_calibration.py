@@ -24,6 +24,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, Pinhole, camera_from_params
 from lightdepth.errors import InputError
+from lightdepth.files.working import working_folder
 from lightdepth.frame import Frame
 from lightdepth.native import pycolmap
 from lightdepth.sfm.config import ADVICE_WITHOUT_CAMERA, Progress, SfmConfig
@@ -107,8 +108,7 @@ def self_calibrated(
     if len(frames) < config.min_model_size:
         found = f"{len(frames)} frame{'s' * (len(frames) != 1)}, of {config.min_model_size} that their motion needs"
         raise InputError("--camera auto", found, ADVICE_WITHOUT_CAMERA)
-    with tempfile.TemporaryDirectory(prefix="self-calibration-") as folder:
-        work = Path(folder)
+    with working_folder() as work:
         for part in ("images", "masks"):
             (work / part).mkdir()
         written = write_images(frames, work / "images", work / "masks", config, progress)
