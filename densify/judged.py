@@ -31,6 +31,7 @@ from densify.evaluation.trajectory import read_trajectories, trajectory_files
 from densify.evaluation.truth import check_truth, read_truth
 from densify.inputs import MapSource, fitted_light, map_and_frames
 from densify.judging.withheld import WithheldOfMap, withheld_errors
+from lightdepth.checkpoint import Device, load_called
 from lightdepth.command_line.presets import shipped
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.reading import stamps_of
@@ -104,6 +105,19 @@ class JudgingConfig(MapReading):
 
 
 @dataclass(frozen=True)
+class DenseModel:
+    """By which model sparse maps are made dense before they are judged."""
+
+    checkpoint: str | None = None
+    """Depth model by which a sparse map is made dense first, as densify does with --recipe and its other settings: path
+    of a checkpoint, bundled name, decline or constant; the surfaces are written. Left out, its points alone are
+    judged."""
+    device: Device = "auto"
+    """What the network of --checkpoint runs on: auto, a CUDA GPU where there is one, else the processor; cpu, the
+    processor; cuda; or mps, the GPU of an Apple computer."""
+
+
+@dataclass(frozen=True)
 class DenseFirst:
     """How sparse maps are made dense before they are judged: as `densify` makes them."""
 
@@ -120,14 +134,23 @@ class DenseFirst:
         return f"Sparse maps were made dense by {self.model.name}, recipe {self.config.recipe}, light {light}{more}"
 
 
-def check_used(checkpoint: str | None, source: TruthSource, config: DensifyConfig, fit_light: bool) -> None:
-    """Raises InputError where settings of what makes maps dense are given, and nothing makes them dense."""
-    if checkpoint is None and (config != DensifyConfig() or source.light is not None or not fit_light):
+def dense_first(
+    predicting: DenseModel, source: TruthSource, config: DensifyConfig, fit_light: bool
+) -> DenseFirst | None:
+    """How sparse maps are made dense first; None without a checkpoint.
+
+    Raises InputError where settings of what makes maps dense are given, and nothing makes them dense.
+    """
+    if predicting.checkpoint is not None:
+        model = load_called(predicting.checkpoint, details=False, device=predicting.device)
+        return DenseFirst(model, config, fit_light)
+    if config != DensifyConfig() or source.light is not None or not fit_light or predicting.device != "auto":
         raise InputError(
-            "settings of densify, --light or --fit-light",
+            "settings of densify, --light, --fit-light or --device",
             "given without --checkpoint: nothing is made dense",
             "add --checkpoint NAME, or leave them out",
         )
+    return None
 
 
 @dataclass(frozen=True)

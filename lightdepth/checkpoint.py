@@ -12,8 +12,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -29,6 +30,8 @@ from lightdepth.network import DepthNetwork, NetworkConfig, build_network
 from lightdepth.reporting.names import told
 
 DEFAULT_CHECKPOINT = "lightdepth-synthetic"
+Device = Literal["auto", "cpu", "cuda", "mps"]
+"""Where a network runs; auto: on a CUDA GPU where there is one, else on the processor."""
 TRAINING_FREE: dict[str, type[DeclineModel] | type[ConstantModel]] = {
     "decline": DeclineModel,
     "constant": ConstantModel,
@@ -67,46 +70,69 @@ def save_model(network: DepthNetwork, path: Path | str, card: dict[str, Any], ha
     write_whole(path, save(weights, metadata=metadata))
 
 
-def load_model(name_or_path: str | Path = DEFAULT_CHECKPOINT, details: bool = True) -> DepthModel:
+@dataclass(frozen=True)
+class ModelSource:
+    """Which depth model predicts, and what it runs on."""
+
+    checkpoint: str = DEFAULT_CHECKPOINT
+    """Depth model: path of a checkpoint (.safetensors or .ckpt), name of a bundled one (lightdepth-synthetic or
+    lightdepth-self), decline (a formula from how light fades, no network) or constant (all equally far, to compare
+    with)."""
+    device: Device = "auto"
+    """What the network runs on: auto, a CUDA GPU where there is one, else the processor; cpu, the processor; cuda; or
+    mps, the GPU of an Apple computer."""
+
+    def load(self, details: bool = True) -> DepthModel:
+        """The model, as `load_called` gives it."""
+        return load_called(self.checkpoint, details, device=self.device)
+
+
+def load_model(
+    name_or_path: str | Path = DEFAULT_CHECKPOINT, details: bool = True, device: Device = "auto"
+) -> DepthModel:
     """The model of that name: `decline`, `constant`, a bundled checkpoint, a .safetensors file, a folder with
     model.safetensors, a Lightning .ckpt, or `hf://OWNER/NAME`, which `from_pretrained` fetches.
 
     `details` False leaves out albedo and normals, where only distance is wanted. Raises InputError when there is no
-    such checkpoint or it cannot be used.
+    such checkpoint or device, or it cannot be used.
     """
-    name = str(name_or_path)
+    name, place = str(name_or_path), _found(device)
     if name == "decline":
         return DeclineModel(details=details)
     if name == "constant":
         return ConstantModel()
     if name in bundled():
-        return _placed(_load_safetensors(_WEIGHTS / f"{name}.safetensors", name, details))
+        return _load_safetensors(_WEIGHTS / f"{name}.safetensors", name, details).to(place)
     if name.startswith(HUB):
-        return from_pretrained(name.removeprefix(HUB), details)
+        return from_pretrained(name.removeprefix(HUB), details, device=device)
     path = Path(name_or_path)
     if (path / WEIGHTS_FILE).is_file():
-        return _placed(_load_safetensors(path / WEIGHTS_FILE, path.resolve().name, details))
+        return _load_safetensors(path / WEIGHTS_FILE, path.resolve().name, details).to(place)
     if not path.is_file():
         known = ", ".join([*bundled(), *TRAINING_FREE])
         what = f"is a folder without {WEIGHTS_FILE}" if path.is_dir() else "no such checkpoint"
         raise InputError(name, what, f"expected a .safetensors or .ckpt file, or one of {known}")
     if path.suffix == ".safetensors":
-        return _placed(_load_safetensors(path, path.stem, details))
+        return _load_safetensors(path, path.stem, details).to(place)
     if path.suffix == ".ckpt":
-        return _placed(_load_lightning(path, details))
+        return _load_lightning(path, details).to(place)
     raise InputError(name, "unknown kind of checkpoint", "expected a name that ends in .safetensors or .ckpt")
 
 
-def load_called(name_or_path: str | Path, details: bool = True, option: str = "checkpoint") -> DepthModel:
+def load_called(
+    name_or_path: str | Path, details: bool = True, option: str = "checkpoint", device: Device = "auto"
+) -> DepthModel:
     """`load_model` for a verb: where the model's name is its path's and may tell a patient, its results are to call it
     by the option and its contents, as they call all inputs. Raises InputError as `load_model` does."""
-    model = load_model(name_or_path, details)
+    model = load_model(name_or_path, details, device)
     if isinstance(model, NetworkModel):
         model.name = told(model.name, **{option: name_or_path})
     return model
 
 
-def from_pretrained(path_or_id: str | Path, details: bool = True, revision: str | None = None) -> DepthModel:
+def from_pretrained(
+    path_or_id: str | Path, details: bool = True, revision: str | None = None, device: Device = "auto"
+) -> DepthModel:
     """The model of a checkpoint's folder or file, or of the id OWNER/NAME of such a folder on the Hugging Face hub.
 
     What lies at the path wins; the network is asked for an id alone, whose files are kept by `huggingface_hub` (extra
@@ -114,8 +140,8 @@ def from_pretrained(path_or_id: str | Path, details: bool = True, revision: str 
     """
     name = str(path_or_id).removeprefix(HUB)
     if Path(path_or_id).exists() or not _HUB_ID.fullmatch(name):
-        return load_model(path_or_id, details)
-    return load_model(_fetched(name, revision), details)
+        return load_model(path_or_id, details, device)
+    return load_model(_fetched(name, revision), details, device)
 
 
 def _fetched(hub_id: str, revision: str | None) -> Path:
@@ -137,9 +163,16 @@ def _fetched(hub_id: str, revision: str | None) -> Path:
         ) from error
 
 
-def _placed(model: NetworkModel) -> NetworkModel:
-    """The model on the GPU where there is one."""
-    return model.to("cuda") if torch.cuda.is_available() else model
+def _found(device: Device) -> str:
+    """What PyTorch calls the device. Raises InputError where this machine has none of it."""
+    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if device == "auto":
+        return "cuda" if there["cuda"] else "cpu"
+    if device not in there:
+        raise InputError("--device", f"{device!r} is not known", f"expected one of {', '.join(get_args(Device))}")
+    if not there[device]:
+        raise InputError("--device", f"{device}, but PyTorch finds no such GPU", "take cpu, or auto")
+    return device
 
 
 def read_card(path: Path | str) -> dict[str, Any]:

@@ -167,6 +167,9 @@ def _rows() -> list[Command]:
         more = "" if verb in ("predict", "adapt") else "--map HERE/colmap"
         for wrong in ("empty.safetensors", "text.safetensors", "bytes.safetensors", "none.safetensors", "folder"):
             rows.append(Command(f"{verb} {DATA} {more} --checkpoint HERE/bad/{wrong} {OUT}", words=wrong))
+    for verb in ("predict", "densify", "live", "demo", "evaluate", "bench"):
+        data = DATA if verb in READS_FRAMES else "HERE/colmap" if verb == "evaluate" else ""
+        rows.append(Command(f"{verb} {data} --device gpu {OUT}", 2, "expected one of auto, cpu, cuda, mps"))
     for verb, more in {**READS_FRAMES, **OUTPUTS}.items():
         data = f"{DATA} " if verb in READS_FRAMES else "HERE/dense " if verb in ("evaluate", "export") else ""
         data = "HERE/camera/camera.json " if verb == "convert-camera" else data

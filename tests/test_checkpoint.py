@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from scenes import cylinder
 
 from lightdepth.camera import Pinhole
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, bundled, load_model, read_card, save_model
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, ModelSource, bundled, load_model, read_card, save_model
 from lightdepth.errors import InputError
 from lightdepth.models import ConstantModel, DeclineModel, NetworkModel
 from lightdepth.module import LightDepth
@@ -67,6 +67,22 @@ def test_the_card_can_be_read_without_building_the_network(tmp_path):
 def test_names_give_the_models_that_need_no_training():
     assert isinstance(load_model("decline"), DeclineModel)
     assert isinstance(load_model("constant"), ConstantModel)
+
+
+def test_a_network_is_where_it_was_asked_for_and_a_device_that_is_not_there_is_refused(monkeypatch):
+    places = []
+    monkeypatch.setattr(NetworkModel, "to", lambda model, device: places.append(device) or model)
+    for there in (False, True):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        monkeypatch.setattr(torch.backends.mps, "is_available", lambda there=there: there)
+        for device in ("auto", "cpu", "cuda", "mps"):
+            if there or device in ("auto", "cpu"):
+                ModelSource("lightdepth-self", device).load()
+                continue
+            for name in ("lightdepth-self", "decline"):
+                with refused(where="--device", found=device, cure="cpu"):
+                    load_model(name, device=device)
+    assert places == ["cpu", "cpu", "cuda", "cpu", "cuda", "mps"]
 
 
 def test_every_bundled_checkpoint_loads_and_has_a_card():

@@ -52,7 +52,7 @@ def small():
 @pytest.fixture(scope="module")
 def run(small, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("per-frame") / "run"
-    bench.compare_per_frame(folder, ("constant",), spoilt=True)
+    bench.compare_per_frame(folder, bench.ModelSources(("constant",)), spoilt=True)
     return folder
 
 
@@ -65,7 +65,7 @@ def test_a_run_says_its_tables_and_the_next_takes_its_colons(run, tmp_path):
     text = (run / "per-frame.md").read_text(encoding="utf-8")
     assert "strong bounce" in text and "weak bounce" in text and "water drops" in text
     assert (run / "colons.png").stat().st_size > 1000
-    bench.compare_per_frame(tmp_path / "again", ("constant",), colons=run / "colons")
+    bench.compare_per_frame(tmp_path / "again", bench.ModelSources(("constant",)), colons=run / "colons")
     again = json.loads((tmp_path / "again" / "per-frame.json").read_text(encoding="utf-8"))
     assert again["rows"] == found["rows"] and not (tmp_path / "again" / "colons").exists()
 

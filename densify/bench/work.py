@@ -24,7 +24,7 @@ from densify.evaluation.judged_map import JudgedMap
 from densify.evaluation.records import SurfaceFigures
 from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
 from densify.pipeline import densify
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, Device, load_called
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.models import DepthModel
@@ -108,9 +108,21 @@ def predicted(
     return replace(still, moving=moving)
 
 
-def load_models(checkpoints: Sequence[str]) -> list[DepthModel]:
+@dataclass(frozen=True)
+class ModelSources:
+    """Which depth models are compared, and what they run on."""
+
+    checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT)
+    """Depth models to compare, each a row: path of a checkpoint, bundled name, decline (a formula from how light fades,
+    no network) or constant (all equally far)."""
+    device: Device = "auto"
+    """What networks run on: auto, a CUDA GPU where there is one, else the processor; cpu, the processor; cuda; or mps,
+    the GPU of an Apple computer."""
+
+
+def load_models(checkpoints: Sequence[str], device: Device = "auto") -> list[DepthModel]:
     """The models that the rows are named after. Raises InputError where two have one name."""
-    models = [load_called(checkpoint, details=False, option="checkpoints") for checkpoint in checkpoints]
+    models = [load_called(checkpoint, details=False, option="checkpoints", device=device) for checkpoint in checkpoints]
     names = [model.name for model in models]
     twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
     if twice is not None:

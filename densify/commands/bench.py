@@ -25,7 +25,7 @@ from densify.bench.record import notes, read_bench, record, tables
 from densify.bench.scenes import Size, scenes
 from densify.bench.spoilt import SpoiltFrame, spoilt_frames, spoilt_tables
 from densify.bench.verdict import compare
-from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, cells_of, load_models, predicted
+from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, ModelSources, cells_of, load_models, predicted
 from densify.config import DensifyConfig, OfflineConfig, Recipe
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT
 from lightdepth.cli import parse
@@ -61,7 +61,7 @@ def run(
     size: Size = "small",
     first_seed: Annotated[int, SEED] = 400,
     wrong_shares: Annotated[tuple[float, ...] | None, BELOW_ONE] = None,
-    checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT),
+    compared: Group[ModelSources] = ModelSources(),
     recipes: tuple[Recipe, ...] = ("paper", "full"),
     cases: tuple[Case, ...] | None = None,
     image_size: Annotated[tuple[int, int] | None, at_least(32, up_to=10_000)] = None,
@@ -81,8 +81,6 @@ def run(
         wrong_shares: Shares, in [0, 1), of wrong map points, each a map of its own (the screening always has 0.3); left
             out, 0.1 and 0.45 (small), or 0, 0.1, 0.3 and 0.45 (full). More shares take longer, and larger ones are
             harder.
-        checkpoints: Depth models to compare, each a row: path of a checkpoint, bundled name, decline (a formula from
-            how light fades, no network) or constant (all equally far).
         recipes: Ways to make surfaces that are compared: full (all steps), paper (as published: one scale per keyframe,
             plain TSDF, and the gates and the reach that densify --recipe paper names), or both. Options of agreement,
             bending, contradiction and rectify count for full alone.
@@ -98,12 +96,12 @@ def run(
             made again.
     """
     arguments = recorded(
+        compared,
         method,
         output=output,
         size=size,
         first_seed=first_seed,
         wrong_shares=wrong_shares,
-        checkpoints=checkpoints,
         recipes=recipes,
         cases=cases,
         image_size=image_size,
@@ -112,15 +110,15 @@ def run(
         size,
         first_seed,
         wrong_shares or SHARES[size],
-        checkpoints=checkpoints,
+        checkpoints=compared.checkpoints,
         recipes=recipes,
         cases=USUAL_CASES[size] if cases is None else cases,
         image_size=image_size or IMAGE_SIZE[size],
         densify=DensifyConfig(**vars(method)),
     )
-    models = load_models(checkpoints)
+    models = load_models(compared.checkpoints, compared.device)
     with run_folder(output, "bench", arguments, overwrite, resume) as folder:
-        folder.hash_inputs(**{checkpoint: Path(checkpoint) for checkpoint in checkpoints})
+        folder.hash_inputs(**{checkpoint: Path(checkpoint) for checkpoint in compared.checkpoints})
         cells, seconds = _cells(folder, config, models)
         found = record(config, cells, seconds)
         _write_json(folder, "bench.json", found)
@@ -214,7 +212,7 @@ def compare_estimators(
 
 def compare_per_frame(
     output: Path = Path("runs/per-frame"),
-    checkpoints: tuple[str, ...] = (DEFAULT_CHECKPOINT, "lightdepth-self"),
+    compared: Group[ModelSources] = ModelSources((DEFAULT_CHECKPOINT, "lightdepth-self")),
     colons: Path | None = None,
     spoilt: bool = False,
     overwrite: bool = False,
@@ -225,8 +223,6 @@ def compare_per_frame(
     Args:
         output: Folder to make, with per-frame.json and .md, and unless --colons is given the colons' frames and their
             truth in colons/, each a sequence that predict and evaluate read, and a picture of them.
-        checkpoints: Depth models to judge, each a row: path of a checkpoint, bundled name or constant. The closed form
-            is always the first row.
         colons: Folder colons/ of an earlier run, whose frames are taken in place of making them anew, which takes some
             ten minutes.
         spoilt: Judge frames with blur, smoke, water drops, clipping, noise and compression too, at five severities:
@@ -234,12 +230,12 @@ def compare_per_frame(
         overwrite: Replace a run made before.
         resume: Go on with the run that was stopped there, as it was begun; colons that were judged are not made again.
     """
-    arguments = recorded(output=output, checkpoints=checkpoints, colons=colons, spoilt=spoilt)
-    models = load_models(tuple(dict.fromkeys((per_frame.BASELINE, *checkpoints))))
+    arguments = recorded(compared, output=output, colons=colons, spoilt=spoilt)
+    models = load_models(tuple(dict.fromkeys((per_frame.BASELINE, *compared.checkpoints))), compared.device)
     rows: list[per_frame.ColonFigures] = []
     bad: list[SpoiltFrame] = []
     with run_folder(output, "bench per-frame", arguments, overwrite, resume) as folder:
-        folder.hash_inputs(colons=colons, **{checkpoint: Path(checkpoint) for checkpoint in checkpoints})
+        folder.hash_inputs(colons=colons, **{checkpoint: Path(checkpoint) for checkpoint in compared.checkpoints})
         sequences = []
         with Progress("Frames", sum(colon.frames for colon in JUDGE_COLONS)) as bar:
             for colon in JUDGE_COLONS:

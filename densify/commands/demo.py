@@ -12,7 +12,8 @@ from densify.evaluation.judged_map import dense_models, read_run
 from densify.evaluation.tables import write_evaluations
 from densify.evaluation.truth import read_truth
 from densify.page import densify_page
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
+from lightdepth.checkpoint import ModelSource
+from lightdepth.command_line.options import Group
 from lightdepth.datasets import open_sequence
 from lightdepth.maps import read_map
 from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
@@ -26,7 +27,7 @@ from lightdepth.tube.slam import SlamConfig, simulate_slam
 
 def demo(
     output: Path = Path("runs/demo"),
-    checkpoint: str = DEFAULT_CHECKPOINT,
+    predicting: Group[ModelSource] = ModelSource(),
     frames: Annotated[int, COUNT] = 40,
     seed: Annotated[int, SEED] = 7,
     size: Annotated[tuple[int, int], at_least(8, up_to=10_000)] = (320, 256),
@@ -38,8 +39,6 @@ def demo(
 
     Args:
         output: Run folder to make, with the data, the surfaces and the report.
-        checkpoint: Depth model: path of a checkpoint, name of a bundled one, decline (a formula from how light fades,
-            no network) or constant (all equally far, to compare with).
         frames: Number of frames to render, 0.7 mm apart. More make a longer path and take longer.
         seed: Number that draws the colon, its light, the path and the map's errors; bundled checkpoints were trained on
             none below 1000. Another one draws another colon.
@@ -50,15 +49,15 @@ def demo(
         overwrite: Replace a run made before.
     """
     arguments = recorded(
+        predicting,
         output=output,
-        checkpoint=checkpoint,
         frames=frames,
         seed=seed,
         size=size,
         lens=lens,
         spurious=spurious,
     )
-    model = load_called(checkpoint, details=False)
+    model = predicting.load(details=False)
     with run_folder(output, "demo", arguments, overwrite) as run:
         with Progress("Rendering", frames) as bar:
             sequence = render_sequence(

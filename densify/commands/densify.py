@@ -9,7 +9,7 @@ from densify.densified import Densified
 from densify.inputs import MapSource, SurfaceFiles, doubts_of_inputs, fitted_light, map_and_frames
 from densify.joining import MergeConfig
 from densify.page import densify_page, joined_section
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
+from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.reporting.run import recorded, run_folder
@@ -20,7 +20,7 @@ def densify(
     source: Group[SequenceSource],
     output: Path,
     mapped: Group[MapSource] = MapSource(),
-    checkpoint: str = DEFAULT_CHECKPOINT,
+    predicting: Group[ModelSource] = ModelSource(),
     config: Group[DensifyConfig] = DensifyConfig(),
     sfm: SfmConfig = SfmConfig(),
     files: Group[SurfaceFiles] = SurfaceFiles(),
@@ -34,8 +34,6 @@ def densify(
 
     Args:
         output: Run folder to make, with the surfaces and the report.
-        checkpoint: Depth model: path of a checkpoint, name of a bundled one, decline (a formula from how light fades,
-            no network) or constant (all equally far, to compare with).
         sfm: how frames are mapped when there is no map
         fit_light: Where neither --light nor the folder gives the light, fit it on the map, and use it if depth by it
             fits hidden blocks of wall better; switched off, a usual light is assumed.
@@ -46,21 +44,21 @@ def densify(
         resume: Go on with the run that was stopped there, as it was begun; a sparse map, a light and submaps that are
             done are not made again.
     """
-    model = load_called(checkpoint, details=False)  # before minutes are spent on a sparse map
+    model = predicting.load(details=False)  # before minutes are spent on a sparse map
     arguments = recorded(
         source,
         mapped,
+        predicting,
         config,
         files,
         output=output,
-        checkpoint=checkpoint,
         sfm=sfm,
         fit_light=fit_light,
         merge=merge,
         merging=merging,
     )
     with run_folder(output, "densify", arguments, overwrite, resume) as run:
-        run.hash_inputs(**source.files, map=mapped.map, checkpoint=Path(checkpoint))
+        run.hash_inputs(**source.files, map=mapped.map, checkpoint=Path(predicting.checkpoint))
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
         doubts = doubts_of_inputs(run, sparse_map, frames)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)

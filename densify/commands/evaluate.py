@@ -10,8 +10,7 @@ from densify.evaluation.judge import judge_gap
 from densify.evaluation.judged_map import read_run
 from densify.evaluation.records import Sources
 from densify.evaluation.tables import write_evaluations
-from densify.judged import DenseFirst, JudgingConfig, TruthSource, check_used, judge_asked, read_asked
-from lightdepth.checkpoint import load_called
+from densify.judged import DenseModel, JudgingConfig, TruthSource, dense_first, judge_asked, read_asked
 from lightdepth.command_line.options import Group
 from lightdepth.reporting.run import recorded, run_folder
 
@@ -22,7 +21,7 @@ def evaluate(
     output: Path | None = None,
     join: Path | None = None,
     suite: Path | None = None,
-    checkpoint: str | None = None,
+    predicting: Group[DenseModel] = DenseModel(),
     trajectory: Path | None = None,
     judging: Group[JudgingConfig] = JudgingConfig(),
     reading: Group[DepthReading] = DepthReading(),
@@ -40,9 +39,6 @@ def evaluate(
             by which the gap between their surfaces is judged.
         suite: YAML file naming the sequences, folders of these names in run and truth, that are judged into one table
             (configs/bench/c3vd.yaml).
-        checkpoint: Depth model by which a sparse map is made dense first, as densify does with --recipe and its other
-            settings: path of a checkpoint, bundled name, decline or constant; the surfaces are written. Left out, its
-            points alone are judged.
         trajectory: TUM file with the pose of every frame that the SLAM localised, judged in place of the keyframes'
             poses.
         fit_light: With --checkpoint, where neither --light nor the truth's folder gives the light, fit it on each map,
@@ -51,6 +47,7 @@ def evaluate(
     """
     arguments = recorded(
         source,
+        predicting,
         judging,
         reading,
         config,
@@ -58,13 +55,11 @@ def evaluate(
         output=output,
         join=join,
         suite=suite,
-        checkpoint=checkpoint,
         trajectory=trajectory,
         fit_light=fit_light,
     )
     asked = read_asked(run, source, judging, join, suite, trajectory, output is None, reading)
-    check_used(checkpoint, source, config, fit_light)
-    first = None if checkpoint is None else DenseFirst(load_called(checkpoint, details=False), config, fit_light)
+    first = dense_first(predicting, source, config, fit_light)
     gap = None if join is None else judge_gap(read_run(run), join)
     with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite or output is None) as out:
         out.hash_inputs(truth=source.truth)

@@ -9,7 +9,7 @@ from densify.config import LiveConfig
 from densify.inputs import MapSource, doubts_of_inputs, fitted_light, map_and_frames
 from densify.live.play import play
 from densify.live.record import PlayedRun
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
+from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
@@ -23,7 +23,7 @@ def live(
     source: Group[SequenceSource],
     output: Path,
     mapped: Group[MapSource] = MapSource(),
-    checkpoint: str = DEFAULT_CHECKPOINT,
+    predicting: Group[ModelSource] = ModelSource(),
     rate: Annotated[float | None, at_least(0.01, up_to=10_000)] = None,
     budget_ms: Annotated[float, above(0)] = 200.0,
     config: Group[LiveConfig] = LiveConfig(),
@@ -36,8 +36,6 @@ def live(
 
     Args:
         output: Run folder to make, with the surfaces and the timings.
-        checkpoint: Depth model: path of a checkpoint, name of a bundled one, decline (a formula from how light fades,
-            no network) or constant (all equally far, to compare with).
         rate: Number of keyframes that arrive per second, whether or not the last is done; left out, each arrives when
             the last is done. More leave less time for each: late ones queue, none is dropped.
         budget_ms: Time within which a keyframe counts as in time, from its image to the renewed surface, milliseconds;
@@ -54,13 +52,13 @@ def live(
         raise InputError("--budget-ms", f"{budget_ms}", "expected milliseconds above 0")
     if rate is not None and not rate > 0:
         raise InputError("--rate", f"{rate}", "expected keyframes per second, above 0")
-    model = load_called(checkpoint, details=False)
+    model = predicting.load(details=False)
     arguments = recorded(
         source,
         mapped,
+        predicting,
         config,
         output=output,
-        checkpoint=checkpoint,
         rate=rate,
         budget_ms=budget_ms,
         sfm=sfm,

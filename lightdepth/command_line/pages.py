@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 _ALWAYS_RARE = (
     *("print_config", "print_shtab", "map_sensor", "time_tolerance", "map_folder", "frame_offset", "keep_names"),
+    "device",
 )
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called
+from lightdepth.checkpoint import ModelSource
 from lightdepth.colour import ColourMeter
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
@@ -30,7 +30,7 @@ from lightdepth.uncalibrated import open_frames
 def predict(
     source: Group[SequenceSource],
     output: Path,
-    checkpoint: str = DEFAULT_CHECKPOINT,
+    predicting: Group[ModelSource] = ModelSource(),
     refine: Annotated[int, at_least(0, up_to=100_000)] = 0,
     uncertainty: Path | None = None,
     previews: bool = True,
@@ -41,9 +41,6 @@ def predict(
 
     Args:
         output: Folder to make, with one .npz for each frame: distance (up to scale), albedo and normals.
-        checkpoint: Depth model: a path (.safetensors or .ckpt) or a bundled name (lightdepth-synthetic or
-            lightdepth-self); decline, distance by formula from brightness alone; constant, the same distance
-            everywhere, to compare with.
         refine: Number of steps in which the predicted distance of each image is changed so that its wall, lit from that
             far, looks more like the image; 0 for none, 100 is usual. More fit the image closer, which is not always
             nearer to the truth, and take longer.
@@ -56,19 +53,17 @@ def predict(
         resume: Go on with the run that was stopped there, as it was begun; frames that are done are not predicted
             again.
     """
-    arguments = recorded(
-        source, output=output, checkpoint=checkpoint, refine=refine, uncertainty=uncertainty, previews=previews
-    )
+    arguments = recorded(source, predicting, output=output, refine=refine, uncertainty=uncertainty, previews=previews)
     if refine < 0:
         raise InputError("--refine", f"{refine}", "expected a number of steps, 0 for none")
     if refine and uncertainty is not None:
         raise InputError("--uncertainty", "refined distance has no uncertainty", "leave out one of it and --refine")
-    model = load_called(checkpoint)
-    factor = None if uncertainty is None else read_factor(uncertainty, *_names(model, checkpoint))
+    model = predicting.load()
+    factor = None if uncertainty is None else read_factor(uncertainty, *_names(model, predicting.checkpoint))
     if refine:
         model = RefinedModel(model, RefineConfig(steps=refine))
     with run_folder(output, "predict", arguments, overwrite, resume) as run:
-        run.hash_inputs(**source.files, checkpoint=Path(checkpoint), uncertainty=uncertainty)
+        run.hash_inputs(**source.files, checkpoint=Path(predicting.checkpoint), uncertainty=uncertainty)
         frames = open_frames(source, run).without_truth()
         if previews:
             (run.folder / "previews").mkdir(exist_ok=True)
