@@ -132,6 +132,8 @@ class SlamFigures:
     """number of submaps whose trajectory could be aligned to the true one"""
     rms_ate_mm: float | None
     """error of the aligned keyframes' centres; None where no submap could be aligned"""
+    rms_rpe_mm: float | None
+    """error of the steps from one aligned keyframe to the next; None where no submap could be aligned"""
 
 
 @dataclass(frozen=True)
@@ -275,7 +277,8 @@ def _trajectory(models: Sequence[JudgedMap], rendered: Rendered) -> SlamFigures:
             aligned.append(align_trajectory(model.trajectory, rendered.truth.poses))
     keyframes = {n for m in models for n in m.trajectory.numbers.tolist()}
     error = rms(np.concatenate([a.ate_sim3 for a in aligned])) if aligned else None
-    return SlamFigures(len(keyframes), len(models), len(aligned), error)
+    of_steps = rms(np.concatenate([a.rpe for a in aligned])) if aligned else None
+    return SlamFigures(len(keyframes), len(models), len(aligned), error, of_steps)
 
 
 def _judged(models: Sequence[JudgedMap], rendered: Rendered, cloud: str) -> RowFigures:
