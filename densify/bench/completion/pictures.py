@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from densify.bench.completion.figures import CellFigures
+from densify.bench.completion.figures import Band, CellFigures, SortedPoint
 from densify.bench.completion.methods import LMEDS, METHODS, OURS, POISSON
 from densify.bench.completion.tables import BEST_SHIFT, better_shift, notes, shown_rows, tables
 from densify.bench.completion.work import DELIVERED, Judged
@@ -63,12 +63,14 @@ def _signed(error: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _panels(titles: Sequence[str]) -> tuple[Any, Sequence[Any]]:
+    """A figure with axes for each title, two in a row."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5.2 * len(titles), 3.9), dpi=110, layout="constrained")
+    down = len(titles) // 2
+    figure = Figure(figsize=(9.8, 3.4 * down + 0.6), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(titles), squeeze=False)[0]
+    panels = figure.subplots(down, 2, squeeze=False).ravel()
     for axes, title in zip(panels, titles, strict=True):
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3)
@@ -82,7 +84,7 @@ def _legend(figure: Any, axes: Any) -> None:
 
 
 def band_picture(cells: Sequence[CellFigures]) -> bytes:
-    """AbsRel and bias by true depth, every row a line, mean over colons weighted by pixels; kinds of error across."""
+    """AbsRel and bias by true depth, every row a line, over the pixels of all colons; a row of panels for each kind."""
     kinds = list(dict.fromkeys(cell.errors for cell in cells))
     figure, panels = _panels([f"{what}, {kind}" for kind in kinds for what in ("AbsRel", "bias")])
     for i, kind in enumerate(kinds):
@@ -95,14 +97,14 @@ def band_picture(cells: Sequence[CellFigures]) -> bytes:
                 panels[2 * i + j].plot(places, 100 * values[j], label=name, color=color, linewidth=width)
         for axes in panels[2 * i : 2 * i + 2]:
             axes.set_xlabel("true depth [mm]")
-        panels[2 * i].set_ylabel("%")
+            axes.set_ylabel("%")
         panels[2 * i].set_ylim(0)
         panels[2 * i + 1].axhline(0, color="black", linewidth=0.6)
     _legend(figure, panels[0])
     return chart_png(figure)
 
 
-def _band_means(bands: Sequence[Any]) -> tuple[list[float], np.ndarray]:
+def _band_means(bands: Sequence[Band]) -> tuple[list[float], np.ndarray]:
     """Middles of the bands, and AbsRel and bias (2, n) of each, weighted by pixels."""
     edges = sorted({(band.from_mm, band.to_mm) for band in bands})
     values = []
@@ -131,7 +133,7 @@ def front_picture(cells: Sequence[CellFigures]) -> bytes:
             else:
                 surface.plot([], [], color=color, linewidth=0.7, label=f"kept by {by}, each colon")
         stated = [cell.sorted for cell in of if cell.sorted]
-        ways: dict[str, Callable[[Any], float]] = {
+        ways: dict[str, Callable[[SortedPoint], float]] = {
             "by predicted uncertainty": lambda p: p.by_uncertainty,
             "by the error itself": lambda p: p.by_error,
         }
