@@ -70,7 +70,7 @@ def _panels(titles: Sequence[str]) -> tuple[Any, Sequence[Any]]:
     down = len(titles) // 2
     figure = Figure(figsize=(9.8, 3.4 * down + 0.6), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(down, 2, squeeze=False).ravel()
+    panels = list(figure.subplots(down, 2, squeeze=False).ravel())
     for axes, title in zip(panels, titles, strict=True):
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3)
