@@ -12,7 +12,6 @@ import pytest
 from raising import refused
 
 from densify.bench.completion import methods, run, scenes
-from densify.bench.completion.curves import bands, front, sorted_errors
 from densify.bench.completion.external import external_folders, read_external
 from densify.bench.completion.figures import CellFigures, KeyframeErrors, RowFigures
 from densify.bench.completion.methods import LMEDS, METHODS, SHIFT, SHIFT_INVERSE, lmeds_scale, median_scale
@@ -21,6 +20,7 @@ from densify.bench.completion.methods import scale_and_shift_of_inverse as by_in
 from densify.bench.completion.poisson import POISSON, _gradients, _interpolation, poisson_completion
 from densify.bench.completion.tables import BEST_SHIFT, better_shift, notes, read_cell, shown_rows, tables
 from densify.bench.completion.work import DELIVERED, Cell
+from densify.bench.curves import bands_of, front, sorted_errors
 from densify.bench.scenes import Rendered, Scene, render
 from densify.bench.work import Predicted, load_models
 from densify.commands.bench import bench
@@ -217,7 +217,7 @@ def compared(ratio: np.ndarray, truth: np.ndarray) -> ComparedDepth:
 
 def test_bands_by_hand():
     truth = np.array([[5.0, 5.0, 25.0], [25.0, 25.0, 70.0]])
-    found = bands([compared(np.array([[1.1, 0.9, 1.2], [1.3, 0.8, 1.0]]), truth)])
+    found = bands_of([compared(np.array([[1.1, 0.9, 1.2], [1.3, 0.8, 1.0]]), truth)])
     assert [(b.from_mm, b.to_mm, b.pixels) for b in found] == [(0, 10, 2), (20, 30, 3), (60, 80, 1)]
     assert [b.abs_rel for b in found] == pytest.approx([0.1, 0.7 / 3, 0.0])
     assert [b.bias for b in found] == pytest.approx([0.0, 0.2, 0.0])
@@ -237,7 +237,7 @@ def test_the_front_of_a_plane_half_of_which_is_wrong_gives_up_the_wrong_half_fir
     flat = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0), [0.0]), -1).reshape(-1, 3)
     off = np.where(flat[:, :1] >= 20, 6.0, 0.1) * (0, 0, 1)
     dense = SimpleNamespace(vertices=(flat + off) / 2, expected_error=off[:, 2] / 2, views=None)
-    found = front(dense, Similarity(2.0, np.eye(3), np.zeros(3)), TrueSurface(flat, "a plane"))
+    found = front([(dense, Similarity(2.0, np.eye(3), np.zeros(3)))], TrueSurface(flat, "a plane"))
     whole, half = found  # two values of the expected error
     assert (whole.kept_share, whole.precision_2mm) == (1.0, 0.5) and whole.threshold == pytest.approx(6.0)
     assert (half.kept_share, half.precision_2mm) == (0.5, 1.0) and half.median_mm == pytest.approx(0.1)

@@ -21,6 +21,7 @@ from densify.bench.completion.scenes import IMAGE_SIZE as SIZES
 from densify.bench.completion.tables import notes as completion_notes
 from densify.bench.completion.tables import record as completion_record
 from densify.bench.completion.tables import tables as completion_tables
+from densify.bench.curve_pictures import bench_picture
 from densify.bench.estimators import (
     NO_LIBRARY,
     EstimatorsConfig,
@@ -84,7 +85,7 @@ def run(
     per-frame and bench completion says more).
 
     Args:
-        output: Folder to make, with bench.json and bench.md.
+        output: Folder to make, with bench.json, bench.md, and bench.png (error against coverage and by distance).
         size: How much is measured: small, two short sequences, minutes; full, eight, and one ten times as long (the
             screening), up to an hour.
         first_seed: Number that seeds the first scene; the others count on from it. Bundled checkpoints were trained on
@@ -137,6 +138,9 @@ def run(
         _write_json(folder, "bench.json", found)
         text = "\n".join([*(t.markdown() for t in tables(found)), *(f"{note}\n" for note in notes(found))])
         (folder.folder / "bench.md").write_text(text, encoding="utf-8", errors="backslashreplace")
+        picture = bench_picture(found["cells"])
+        if picture is not None:
+            (folder.folder / "bench.png").write_bytes(picture)
         folder.log(text)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from densify.bench.curves import Band, FrontPoint, SortedPoint
 from densify.evaluation.records import SurfaceFigures
 
 
@@ -23,22 +24,6 @@ class KeyframeErrors:
 
 
 @dataclass(frozen=True)
-class Band:
-    """Pixels whose true depth is within a band, of all keyframes of a row."""
-
-    from_mm: float
-    """true depth from which on a pixel counts"""
-    to_mm: float
-    """true depth up to which it counts"""
-    pixels: int
-    """number of pixels"""
-    abs_rel: float
-    """mean of |p - q| / q"""
-    bias: float
-    """median of p / q - 1: above 0 where the wall is put too far"""
-
-
-@dataclass(frozen=True)
 class RowFigures:
     """One way to complete the keyframes of a cell, or why there is nothing to judge."""
 
@@ -52,38 +37,6 @@ class RowFigures:
     """by true depth"""
     surface: SurfaceFigures | None = None
     """the keyframes fused into one surface; None where none came about"""
-
-
-@dataclass(frozen=True)
-class FrontPoint:
-    """A surface of which only what is trusted most is kept."""
-
-    by: str
-    """what is swept: expected error, or views"""
-    threshold: float
-    """largest expected error [mm], or least number of views, that is kept"""
-    kept_share: float
-    """share of the surface's vertices that are kept"""
-    rms_mm: float
-    """from the kept vertices to the truth"""
-    median_mm: float
-    """median of the same"""
-    precision_2mm: float
-    """share of the kept vertices within 2 mm of the truth"""
-    recall_2mm: float
-    """share of the true points within 2 mm of the kept vertices"""
-
-
-@dataclass(frozen=True)
-class SortedPoint:
-    """Pixels of which only what is most certain is kept."""
-
-    kept_share: float
-    """share of the pixels that are kept"""
-    by_uncertainty: float
-    """mean of |p - q| / q over the pixels whose uncertainty is predicted least"""
-    by_error: float
-    """the same over those that err least: what no uncertainty can beat"""
 
 
 @dataclass(frozen=True)

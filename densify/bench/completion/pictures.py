@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from densify.bench.completion.figures import Band, CellFigures, SortedPoint
+from densify.bench.completion.figures import CellFigures
 from densify.bench.completion.methods import LMEDS, METHODS, OURS, POISSON
 from densify.bench.completion.tables import BEST_SHIFT, better_shift, notes, shown_rows, tables
 from densify.bench.completion.work import DELIVERED, Judged
+from densify.bench.curve_pictures import band_means, draw_front, legend_below, name_front, panels_for
+from densify.bench.curves import SortedPoint
 from densify.evaluation.errors import true_depth
 from lightdepth.geometry import depth_from_distance
 from lightdepth.reporting.figures import (
@@ -62,36 +63,15 @@ def _signed(error: np.ndarray, known: np.ndarray) -> np.ndarray:
     return np.where(known[..., None], colors, 120).astype(np.uint8)
 
 
-def _panels(titles: Sequence[str]) -> tuple[Any, Sequence[Any]]:
-    """A figure with axes for each title, two in a row."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    down = len(titles) // 2
-    figure = Figure(figsize=(9.8, 3.4 * down + 0.6), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = list(figure.subplots(down, 2, squeeze=False).ravel())
-    for axes, title in zip(panels, titles, strict=True):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.3)
-        axes.set_title(title, fontsize=10)
-    return figure, panels
-
-
-def _legend(figure: Any, axes: Any) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
-
-
 def band_picture(cells: Sequence[CellFigures]) -> bytes:
     """AbsRel and bias by true depth, every row a line, over the pixels of all colons; a row of panels for each kind."""
     kinds = list(dict.fromkeys(cell.errors for cell in cells))
-    figure, panels = _panels([f"{what}, {kind}" for kind in kinds for what in ("AbsRel", "bias")])
+    figure, panels = panels_for([f"{what}, {kind}" for kind in kinds for what in ("AbsRel", "bias")])
     for i, kind in enumerate(kinds):
         of = [shown_rows(cell) for cell in cells if cell.errors == kind]
         for color, name in zip(_COLORS, of[0], strict=False):
             rows = [row for each in of if (row := each.get(name)) is not None]
-            places, values = _band_means([band for row in rows for band in row.bands])
+            places, values = band_means([band for row in rows for band in row.bands])
             for j in (0, 1):
                 width = 2.2 if name in (OURS, DELIVERED) else 1.3
                 panels[2 * i + j].plot(places, 100 * values[j], label=name, color=color, linewidth=width)
@@ -100,19 +80,8 @@ def band_picture(cells: Sequence[CellFigures]) -> bytes:
             axes.set_ylabel("%")
         panels[2 * i].set_ylim(0)
         panels[2 * i + 1].axhline(0, color="black", linewidth=0.6)
-    _legend(figure, panels[0])
+    legend_below(figure, panels[0])
     return chart_png(figure)
-
-
-def _band_means(bands: Sequence[Band]) -> tuple[list[float], np.ndarray]:
-    """Middles of the bands, and AbsRel and bias (2, n) of each, weighted by pixels."""
-    edges = sorted({(band.from_mm, band.to_mm) for band in bands})
-    values = []
-    for edge in edges:
-        own = [band for band in bands if (band.from_mm, band.to_mm) == edge]
-        weights = [band.pixels for band in own]
-        values.append([np.average([getattr(b, key) for b in own], weights=weights) for key in ("abs_rel", "bias")])
-    return [(low + high) / 2 for low, high in edges], np.array(values).T.reshape(2, -1)
 
 
 def front_picture(cells: Sequence[CellFigures]) -> bytes:
@@ -120,18 +89,12 @@ def front_picture(cells: Sequence[CellFigures]) -> bytes:
     error and by views, a thin line for each colon and a thick one for their mean; and the depth's AbsRel over the
     share of pixels kept."""
     kinds = list(dict.fromkeys(cell.errors for cell in cells))
-    figure, panels = _panels([f"{what}, {kind}" for kind in kinds for what in ("surface", "depth")])
+    figure, panels = panels_for([f"{what}, {kind}" for kind in kinds for what in ("surface", "depth")])
     for i, kind in enumerate(kinds):
         of = [cell for cell in cells if cell.errors == kind]
         surface, depth = panels[2 * i], panels[2 * i + 1]
         for by, color in (("expected error", "#1060b0"), ("views", "#e0a030")):
-            lines = [[(p.recall_2mm, p.median_mm) for p in cell.front if p.by == by] for cell in of]
-            for line in filter(None, lines):
-                surface.plot(*np.array(line).T, color=color, linewidth=0.7, alpha=0.5, marker=".", markersize=3)
-            if lines and len({len(line) for line in lines}) == 1 and lines[0]:
-                surface.plot(*np.mean(lines, 0).T, color=color, linewidth=2.4, label=f"kept by {by}")
-            else:
-                surface.plot([], [], color=color, linewidth=0.7, label=f"kept by {by}, each colon")
+            draw_front(surface, [cell.front for cell in of], by, color)
         stated = [cell.sorted for cell in of if cell.sorted]
         ways: dict[str, Callable[[SortedPoint], float]] = {
             "by predicted uncertainty": lambda p: p.by_uncertainty,
@@ -141,9 +104,7 @@ def front_picture(cells: Sequence[CellFigures]) -> bytes:
             if stated:
                 curve = np.mean([[value(p) for p in points] for points in stated], 0)
                 depth.plot([100 * p.kept_share for p in stated[0]], 100 * curve, color=color, label=label)
-        surface.set_xlabel("true points within 2 mm (recall)")
-        surface.set_ylabel("median error [mm]")
-        surface.set_ylim(0)
+        name_front(surface)
         depth.set_xlabel("pixels kept [%]")
         depth.set_ylabel("AbsRel [%]")
         depth.set_ylim(0)

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from pydantic import TypeAdapter
 
-from densify.bench.completion.curves import BANDS_MM
 from densify.bench.completion.figures import CellFigures, RowFigures
 from densify.bench.completion.methods import LMEDS, METHODS, OURS, POISSON, SHIFT, SHIFT_INVERSE
 from densify.bench.completion.poisson import POISSON as POISSON_CONFIG
 from densify.bench.completion.scenes import SEEDS, TUNING_SEEDS
 from densify.bench.completion.work import DELIVERED
+from densify.bench.curves import BANDS_MM
 from densify.evaluation.records import SurfaceFigures
 from densify.evaluation.tables import Table
 

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.bench.completion.curves import bands, front, sorted_errors
 from densify.bench.completion.external import read_external
 from densify.bench.completion.figures import CellFigures, KeyframeErrors, RowFigures
 from densify.bench.completion.methods import METHODS, Completed, Task
 from densify.bench.completion.scenes import Errors, map_with
+from densify.bench.curves import bands_of, front, sorted_errors
 from densify.bench.scenes import Rendered
 from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
@@ -115,7 +115,7 @@ def judged_cell(
         keyframes=len(task.keyframes),
         left_out=task.left_out,
         rows=rows,
-        front=front(result.dense, aligned.true_from_map, cell.rendered.truth.surface),
+        front=front([(result.dense, aligned.true_from_map)], cell.rendered.truth.surface),
         sorted=sorted_errors(compared, sigmas),
     )
     return Judged(figures, task, completed, mm)
@@ -153,7 +153,7 @@ def _row(cell: Cell, task: Task, completed: Completed, vertices: np.ndarray, mm:
         return RowFigures("no keyframe was aligned")
     each = {name: _errors(c) for name, c in compared.items()}
     mean = KeyframeErrors(*np.mean([astuple(e) for e in each.values()], 0).tolist())
-    return RowFigures("", mean, each, bands(list(compared.values())), _surface(cell, task, vertices))
+    return RowFigures("", mean, each, bands_of(list(compared.values())), _surface(cell, task, vertices))
 
 
 def _errors(compared: ComparedDepth) -> KeyframeErrors:
