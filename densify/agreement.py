@@ -38,6 +38,7 @@ from lightdepth.sparse_map import Keyframe
 
 _STEP = 1e-3  # of log distance, to differentiate by
 _CELLS = 8  # across and down an image: parts whose points share their errors
+_WIDTH = 2.0  # sigmas; half weight at 1.3 of them, so that fewer good residuals are lost
 _LEAST_SIGMA = 0.01  # of log distance: exact data must not make a single residual decide
 
 
@@ -123,7 +124,7 @@ def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, be
     pairs = _pairs(shared, config.neighbours) if config.overlap else []
     places = [_Places(view, bend, config.samples) for view, bend in zip(views, bends, strict=True)]
     w = np.concatenate([bend.weights for bend in bends])
-    most = [_inlier_deviation(_residual(*each)) for each in zip(views, bends, places, strict=True)]
+    most = [inlier_deviation(_residual(*each)) for each in zip(views, bends, places, strict=True)]
     for _ in range(config.rounds):
         points = [_point_rows(i, *each, config) for i, each in enumerate(zip(views, bends, places, most, strict=True))]
         rows = points + _overlap_rows(views, bends, places, pairs, config, points)
@@ -201,19 +202,11 @@ class _Places:
 
     @cached_property
     def growth(self) -> np.ndarray:
-        """How many times as large as a middling point's the deviation of each observed point (n,) is: a triangulated
-        distance errs with its square, so its logarithm in proportion to it."""
-        mapped = self.view.observed.mapped
-        ratio = mapped / np.median(mapped)
-        result: np.ndarray = np.sqrt((1 + ratio**2) / 2).clip(max=3)
-        return result
+        return growth_of(self.view.observed.mapped)
 
     @cached_property
     def cells(self) -> np.ndarray:
-        """The part of the image (n,) that each observed point lies in."""
-        place = np.clip((self.view.observed.pixels / self.bend.image_size * _CELLS).astype(int), 0, _CELLS - 1)
-        result: np.ndarray = place[:, 1] * _CELLS + place[:, 0]
-        return result
+        return cells_of(self.view.observed.pixels, self.bend.image_size)
 
     @cached_property
     def grid(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -232,14 +225,45 @@ def _residual(view: View, bend: Bend, places: _Places) -> np.ndarray:
 
 def _point_rows(index: int, view: View, bend: Bend, places: _Places, most: float, config: AgreementConfig) -> _Rows:
     residual = _residual(view, bend, places)
-    sigma = min(_inlier_deviation(residual), most) * places.growth
-    weight = _weight(residual / sigma) / sigma**2
+    weight = point_weights(residual, places.growth, places.cells, most, config.shared_error)
+    return _Rows(residual, weight, {index: places.at_points})
+
+
+def point_weights(
+    residual: np.ndarray,
+    growth: np.ndarray,
+    cells: np.ndarray,
+    most: float,
+    shared_error: float,
+    width: float = _WIDTH,
+) -> np.ndarray:
+    """Weights (n,) of points by their residuals (n,) of log distance: small where a point is wrong. `growth` and
+    `cells` (n,) as the functions below have them; `most` is the largest deviation that the points may have; at `width`
+    deviations a quarter of a point's weight is left."""
+    sigma = min(inlier_deviation(residual), most) * growth
+    weight = robust_weights(residual / sigma / width) / sigma**2
     # Points of one cell share an error: together they tell no more than one point with that error would.
-    told = np.bincount(places.cells, weight, _CELLS**2)[places.cells]
-    return _Rows(residual, weight / (1 + told * config.shared_error**2), {index: places.at_points})
+    told = np.bincount(cells, weight, _CELLS**2)[cells]
+    result: np.ndarray = weight / (1 + told * shared_error**2)
+    return result
 
 
-def _inlier_deviation(residual: np.ndarray) -> float:
+def growth_of(mapped: np.ndarray) -> np.ndarray:
+    """How many times as large as a middling point's the deviation of each observed point (n,) is: a triangulated
+    distance errs with its square, so its logarithm in proportion to it."""
+    ratio = mapped / np.median(mapped)
+    result: np.ndarray = np.sqrt((1 + ratio**2) / 2).clip(max=3)
+    return result
+
+
+def cells_of(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """The part of the image (n,) that each observed point, at pixels (n, 2), lies in."""
+    place = np.clip((pixels / image_size * _CELLS).astype(int), 0, _CELLS - 1)
+    result: np.ndarray = place[:, 1] * _CELLS + place[:, 0]
+    return result
+
+
+def inlier_deviation(residual: np.ndarray) -> float:
     """Standard deviation, where up to half of the residuals are wrong: from the lower quartile, which they inflate
     less than the median."""
     return max(lower_quartile(np.abs(residual)) / 0.3186, _LEAST_SIGMA)
@@ -250,7 +274,7 @@ def _deviation(residual: np.ndarray) -> float:
 
 
 def _weight(x: np.ndarray) -> np.ndarray:
-    return robust_weights(x / 2)  # half weight at 1.3 sigma, so that fewer good residuals are lost
+    return robust_weights(x / _WIDTH)
 
 
 def _pairs(shared: np.ndarray, neighbours: int) -> list[tuple[int, int]]:

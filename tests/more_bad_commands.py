@@ -249,6 +249,11 @@ MORE = [
     Command(f"bench estimators {OUT} --shares [1.5]", words="--shares"),
     Command(f"bench per-frame {OUT} --checkpoints HERE/nowhere", words="nowhere"),
     Command(f"bench per-frame {OUT} --checkpoints [] --colons HERE/nowhere", words="nowhere"),
+    Command(f"bench completion {OUT} --checkpoint HERE/nowhere", words="nowhere"),
+    Command(f"bench completion {OUT} --errors []", words="at least one"),
+    Command(f"bench completion {OUT} --external [mine]", words="NAME=FOLDER"),
+    Command(f"bench completion {OUT} --external [mine=HERE/nowhere]", words="nowhere"),
+    Command(f"bench completion {OUT} --external [ours=HERE/others]", words="another name"),
     # ---- places for the output
     Command(f"predict {DATA} {DECLINE} -o HERE/file", words="file"),
     Command(f"predict {DATA} {DECLINE} -o HERE/others", words="others"),

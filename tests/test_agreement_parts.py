@@ -10,7 +10,6 @@ from densify.agreement import (
     AgreementConfig,
     View,
     _deviation,
-    _inlier_deviation,
     _overlap_rows,
     _pairs,
     _Places,
@@ -19,6 +18,7 @@ from densify.agreement import (
     _step,
     agree,
     gap_between,
+    inlier_deviation,
 )
 from densify.agreement import unbent as start
 from densify.bending import Bend, BendingConfig
@@ -94,9 +94,9 @@ def test_points_weigh_by_their_deviation_which_grows_with_distance_and_by_the_co
 
 def test_deviations_are_those_of_a_normal_distribution_and_never_none():
     residual = np.random.default_rng(0).normal(0, 0.2, 20_000)
-    assert _inlier_deviation(residual) == pytest.approx(0.2, rel=0.03)
+    assert inlier_deviation(residual) == pytest.approx(0.2, rel=0.03)
     assert _deviation(residual) == pytest.approx(0.2, rel=0.03)
-    assert _inlier_deviation(np.zeros(5)) == _deviation(np.zeros(5)) == 0.01
+    assert inlier_deviation(np.zeros(5)) == _deviation(np.zeros(5)) == 0.01
 
 
 def test_the_overlap_weighs_by_its_own_deviation_but_not_less_than_the_points():

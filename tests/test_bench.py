@@ -66,8 +66,29 @@ def test_a_run_has_every_row_for_every_share_with_units_and_versions(made):
     for rows in erring:
         assert list(rows) == ["sparse map", "decline, one scale", "decline, full"]
         assert 0 < rows["decline, one scale"]["rms_mm"] < 20
+    assert (made / "bench.png").stat().st_size > 10_000
     table = (made / "bench.md").read_text()
     assert "30% wrong points." in table and all(title in table for title in COLUMNS.values()) and "tiny (311)" in table
+
+
+def test_dense_rows_have_their_error_by_distance_and_those_that_tell_vertices_apart_a_front(made):
+    for cell in json.loads((made / "bench.json").read_text())["cells"]:
+        for name, row in cell["rows"].items():
+            assert ("bands" in row) == ("decline" in name) and ("front" in row) == (
+                name != "decline, paper" and "bands" in row
+            )
+            for by in ("expected error", "views") if "front" in row else ():
+                kept = [point for point in row["front"] if point["by"] == by]
+                shares = [point["kept_share"] for point in kept]
+                assert shares[0] == 1 and shares == sorted(shares, reverse=True)
+                assert kept[0]["median_mm"] == pytest.approx(row["median_mm"])
+                assert kept[0]["precision_2mm"] == pytest.approx(row["precision"]["2mm"])
+                recalls = [point["recall_2mm"] for point in kept]
+                assert recalls == sorted(recalls, reverse=True)
+            if "bands" in row:
+                pixels = np.array([band["pixels"] for band in row["bands"]])
+                errors = np.array([band["abs_rel"] for band in row["bands"]])
+                assert (pixels * errors).sum() / pixels.sum() == pytest.approx(row["depth_abs_rel"], rel=0.15)
 
 
 def test_a_wall_that_moves_is_seen_from_the_same_places_and_judged_as_it_is_at_rest(monkeypatch):

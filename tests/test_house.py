@@ -58,6 +58,7 @@ def verbs() -> Iterator[tuple[str, Callable[..., Any]]]:
     yield from (("bench", bench.run), ("bench compare", bench.compare_runs))
     yield "bench estimators", bench.compare_estimators
     yield "bench per-frame", bench.compare_per_frame
+    yield "bench completion", bench.compare_completions
 
 
 def test_values_without_a_type_are_only_where_files_are_read_and_written():

@@ -40,7 +40,7 @@ GENERAL = ("help", "config", "print_config", "print_shtab", "overwrite", "resume
 
 @cache
 def parsers() -> dict[str, Parser]:
-    """The parser of every verb; `bench` has four, and `train` makes its own."""
+    """The parser of every verb; `bench` has five, and `train` makes its own."""
     found = {}
     for entry in metadata.entry_points(group=GROUP):
         function = entry.load()
@@ -51,6 +51,7 @@ def parsers() -> dict[str, Parser]:
                 found[verb] = verb_parser(function.__globals__[name], verb)
             found["bench estimators"] = verb_parser(function.__globals__["compare_estimators"], "bench estimators")
             found["bench per-frame"] = verb_parser(function.__globals__["compare_per_frame"], "bench per-frame")
+            found["bench completion"] = verb_parser(function.__globals__["compare_completions"], "bench completion")
         else:
             found[entry.name] = verb_parser(function, entry.name)
     return found
@@ -181,7 +182,7 @@ def test_the_examples_are_understood(verb):
         assert example.startswith(f"lightdepth {verb}")
         for command in example.split(" && "):
             words = shlex.split(command)[1:]
-            if words[0] == "bench" and words[1:2] in (["compare"], ["estimators"], ["per-frame"]):
+            if words[0] == "bench" and words[1:2] in (*(["compare"], ["estimators"], ["per-frame"], ["completion"]),):
                 words[:2] = [" ".join(words[:2])]
             if not any(word.startswith("configs/") for word in words):
                 parsed(parsers()[words[0]], words[1:])

@@ -76,7 +76,7 @@ def test_every_command_of_the_readme_is_understood(command):
             from densify.commands import bench
 
             ways = {"compare": bench.compare_runs, "estimators": bench.compare_estimators}
-            ways["per-frame"] = bench.compare_per_frame
+            ways |= {"per-frame": bench.compare_per_frame, "completion": bench.compare_completions}
             name = words.pop(0) if words[0] in ways else ""
             function = ways.get(name, bench.run)
             parser = verb_parser(function, f"bench {name}".strip())

@@ -108,7 +108,7 @@ def test_the_report_names_keyframes_that_were_left_out_and_maps_that_could_not_b
     failed = replace(result.dense.alignments[1], reason="sigma is 50% of the median distance")
     dense = replace(result.dense, alignments=(result.dense.alignments[0], failed, *result.dense.alignments[2:]))
     distances = DistanceFigures(1.5, 0.7, 3.0)
-    cloud = SurfaceFigures(9, 1.5, 0.7, 3.0, None, distances, {}, {}, {})
+    cloud = SurfaceFigures(9, 1.5, 0.7, 3.0, None, distances, {}, {}, {}, 0.9)
     first = MapFigures(0, 4, aligned=AlignedFigures(4, 0.12, None, 1.0, 1.0), clouds={"dense": cloud, "sparse": None})
     judged = [first, MapFigures(1, 2, "2 common poses")]
     page = densify_page("Maps", [replace(result, dense=dense, judgement=None)], gallery, [], judged)

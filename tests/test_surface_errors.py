@@ -55,6 +55,7 @@ def test_distances_agree_with_trying_every_pair(seed):
     assert summary.points == 70 and summary.to_mesh is None
     assert summary.rms_mm == pytest.approx(np.sqrt((pairs.min(1) ** 2).mean()), abs=1e-9)
     assert summary.median_mm == pytest.approx(sorted(pairs.min(1))[34] / 2 + sorted(pairs.min(1))[35] / 2, abs=1e-9)
+    assert summary.chamfer_mm == pytest.approx((pairs.min(1).mean() + pairs.min(0).mean()) / 2, abs=1e-9)
     for t in THRESHOLDS:
         p = sum(d <= t for d in pairs.min(1)) / 70
         r = sum(d <= t for d in pairs.min(0)) / 130
@@ -207,7 +208,7 @@ def figures(judged) -> dict[str, float]:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_map_s_frame_of_reference_unit_and_order_of_points_do_not_matter(seed, world):
     expected = figures(judge_maps([model(seed, IDENTITY)], world))
-    assert len(expected) == 19 and expected["to_mesh/median_mm"] > 0
+    assert len(expected) == 20 and expected["to_mesh/median_mm"] > 0
     rng = np.random.default_rng(seed)
     away = Similarity(float(np.exp(2 * rng.normal())), Rotation.random(rng=rng).as_matrix(), 30 * rng.normal(size=3))
     exact = {k: v for k, v in expected.items() if not k.startswith("to_mesh")}

@@ -108,6 +108,20 @@ def test_se3_keeps_the_map_s_scale_and_is_left_out_where_that_is_not_known():
     assert align_trajectory(trajectory(source), poses(target)).summary().rms_ate_se3_mm is None
 
 
+def test_a_single_jump_is_one_wrong_step_and_noise_of_every_pose_is_every_step_s():
+    target = case(3, 30)[1]
+    shaken = target + np.where(np.arange(30)[:, None] % 2, (0.0, 0.0, 0.2), 0.0)
+    jumped = target + np.where(np.arange(30)[:, None] >= 15, (0.0, 0.0, 0.2), 0.0)
+    sums = []
+    for source in (shaken, jumped):
+        found = align_trajectory(trajectory(source), poses(target))
+        moved = found.true_from_map.apply(source)
+        by_hand = [np.linalg.norm((moved[i + 1] - moved[i]) - (target[i + 1] - target[i])) for i in range(29)]
+        np.testing.assert_allclose(found.rpe, by_hand, atol=1e-12)
+        sums.append(trajectory_summary([found], [trajectory(source)], list(range(30))).rms_rpe_mm)
+    assert sums[0] == pytest.approx(0.2, rel=0.1) and sums[1] < 0.5 * sums[0]
+
+
 def test_submaps_are_averaged_as_climb_does_and_pooled_over_their_poses():
     parts = [case(seed, n) for seed, n in ((0, 120), (1, 300), (2, 40))]
     true, trajectories, first = {}, [], 0

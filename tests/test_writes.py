@@ -44,6 +44,8 @@ ALLOWED = {
     "densify/commands/bench.py: run": _RUN,
     "densify/commands/bench.py: compare_estimators": _RUN,
     "densify/commands/bench.py: compare_per_frame": _RUN,
+    "densify/commands/bench.py: compare_completions": _RUN,
+    "densify/bench/completion/run.py: completed_cells": _RUN,
     "densify/dense_map.py: write": _RUN,
     "densify/densified.py: write": _RUN,
     "densify/exporting/work.py: export_maps": _RUN,

@@ -26,15 +26,23 @@ COLUMNS = {
     "rms_mm": "RMS Acc. mm",
     "median_mm": "MedA Acc. mm",
     "completeness_median_mm": "Completeness mm",
+    "chamfer_mm": "Chamfer mm",
+    "precision.1mm": "Precision 1 mm",
+    "recall.1mm": "Recall 1 mm",
+    "f_score.1mm": "F 1 mm",
+    "precision.2mm": "Precision 2 mm",
+    "recall.2mm": "Recall 2 mm",
+    "f_score.2mm": "F 2 mm",
     "depth_abs_rel": "Depth AbsRel",
     "scale_error": "Scale error",
     "unaligned_share": "KF left out",
 }
 UNITS = (
     "mm; shares, depth_abs_rel and scale_error of 1. rms_mm, median_mm, p90_mm: from each model point to the closest "
-    "true point; completeness: from each true point to the closest model point; depth_*: of the aligned keyframes' "
-    "depth, mean over keyframes; scale_error: |median of predicted / true depth - 1| of a keyframe, mean over "
-    "keyframes; keyframes are left out where their alignment is not trusted"
+    "true point; completeness: from each true point to the closest model point; chamfer_mm: mean of the mean distances "
+    "both ways; precision, recall, f_score: shares of model and true points within a distance, and their harmonic "
+    "mean; depth_*: of the aligned keyframes' depth, mean over keyframes; scale_error: |median of predicted / true "
+    "depth - 1| of a keyframe, mean over keyframes; keyframes are left out where their alignment is not trusted"
 )
 ALIGNMENT = (
     "Sim(3) of each submap's keyframes to the true ones (least ATE), for surfaces and depth alike; depth is not "
@@ -119,6 +127,10 @@ def figure(row: Mapping[str, Any], key: str) -> float | None:
     """A column's value in a row; None where it has none."""
     if key == "completeness_median_mm":
         return row["completeness"]["median_mm"] if row.get("completeness") else None
+    if "." in key:  # shares within a distance, which runs of earlier versions have as well
+        shares, _, distance = key.partition(".")
+        share: float | None = row.get(shares, {}).get(distance)
+        return share
     if key == "unaligned_share":
         return 1 - row["keyframes_aligned"] / row["keyframes"] if row.get("keyframes") else None
     value = row.get(key)
@@ -149,8 +161,14 @@ def _slam_table(cells: Sequence[Mapping[str, Any]]) -> Table:
     first = {cell["scene"]: cell for cell in reversed(cells)}
     of = [first[name] for name in dict.fromkeys(cell["scene"] for cell in cells)]
     lines: list[list[Any]] = [["# Frames", *(cell["frames"] for cell in of)]]
-    for title, key in (("# KF", "keyframes"), ("RMS ATE mm, Sim(3)", "rms_ate_mm"), ("# Submaps", "submaps")):
-        lines.append([title, *(cell["trajectory"][key] for cell in of)])
+    for title, key in (
+        ("# KF", "keyframes"),
+        ("RMS ATE mm, Sim(3)", "rms_ate_mm"),
+        ("RMS RPE mm, Sim(3)", "rms_rpe_mm"),
+        ("# Submaps", "submaps"),
+    ):
+        if any(key in cell["trajectory"] for cell in of):
+            lines.append([title, *(cell["trajectory"].get(key) for cell in of)])
     rows = [[*line, *_mean(line[1:])] for line in lines]
     average = ["avg"] if len(of) > 1 else []
     return Table("The simulated SLAM.", ["Metrics", *(_column(cell) for cell in of), *average], rows)

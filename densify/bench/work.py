@@ -15,6 +15,7 @@ from typing import Annotated
 import numpy as np
 
 from densify.bench.cases import CASES, WRONG_SHARE, Case
+from densify.bench.curves import Band, FrontPoint, bands, front
 from densify.bench.scenes import Rendered, Scene, Size, render, render_moving
 from densify.config import DensifyConfig, Recipe
 from densify.dense_map import DenseMap
@@ -24,6 +25,7 @@ from densify.evaluation.judged_map import JudgedMap
 from densify.evaluation.records import SurfaceFigures
 from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
 from densify.pipeline import densify
+from densify.similarity import Similarity
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, Device, load_called
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
@@ -144,6 +146,8 @@ class SlamFigures:
     """number of submaps whose trajectory could be aligned to the true one"""
     rms_ate_mm: float | None
     """error of the aligned keyframes' centres; None where no submap could be aligned"""
+    rms_rpe_mm: float | None
+    """error of the steps from one aligned keyframe to the next; None where no submap could be aligned"""
 
 
 @dataclass(frozen=True)
@@ -186,6 +190,10 @@ class RowFigures:
     """errors of the keyframes' depth, for dense maps"""
     counts: Counts | None = None
     """how many keyframes took part, for dense maps"""
+    bands: Sequence[Band] = ()
+    """the keyframes' depth by true depth, for dense maps"""
+    front: Sequence[FrontPoint] = ()
+    """error against coverage of the surface, where its vertices are told apart (recipe full)"""
 
     def record(self) -> dict[str, object]:
         """As bench.json has it."""
@@ -193,6 +201,8 @@ class RowFigures:
         flat = {key: value for part in parts if part is not None for key, value in asdict(part).items()}
         if self.surface is None:
             return {"error": self.error, **flat}
+        flat |= {"bands": [asdict(band) for band in self.bands]} if self.bands else {}
+        flat |= {"front": [asdict(point) for point in self.front]} if self.front else {}
         return {**asdict(self.surface), "submaps_judged": self.submaps_judged, **flat}
 
 
@@ -287,7 +297,8 @@ def _trajectory(models: Sequence[JudgedMap], rendered: Rendered) -> SlamFigures:
             aligned.append(align_trajectory(model.trajectory, rendered.truth.poses))
     keyframes = {n for m in models for n in m.trajectory.numbers.tolist()}
     error = rms(np.concatenate([a.ate_sim3 for a in aligned])) if aligned else None
-    return SlamFigures(len(keyframes), len(models), len(aligned), error)
+    of_steps = rms(np.concatenate([a.rpe for a in aligned])) if aligned else None
+    return SlamFigures(len(keyframes), len(models), len(aligned), error, of_steps)
 
 
 def _judged(models: Sequence[JudgedMap], rendered: Rendered, cloud: str) -> RowFigures:
@@ -302,24 +313,45 @@ def _judged(models: Sequence[JudgedMap], rendered: Rendered, cloud: str) -> RowF
 
 
 def _dense_row(made: Sequence[DenseMap], rendered: Rendered, known: Mapping[str, DepthPrediction]) -> RowFigures:
-    """The surface's figures, and the mean over the aligned keyframes of their depth's, in the scale of the map."""
-    depths = [d for m in made for d in _depths(m, rendered, known)]
+    """The surface's figures, the mean over the aligned keyframes of their depth's, in the scale of the map, and the
+    curves of both."""
+    placed = _placed(made, rendered)
+    depths = [d for m, true_from_map in placed for d in _depths(m, true_from_map.scale, rendered, known)]
     found = _judged([_model(m.submap, dense=m.vertices) for m in made], rendered, "dense")
     counts = Counts(sum(len(m.alignments) for m in made), sum(len(m.aligned) for m in made))
     if found.error or not depths:
         reasons = [a.reason for m in made for a in m.alignments if not a.ok]
         why = f"no keyframe was aligned; the first: {reasons[0]}" if not counts.keyframes_aligned else found.error
         return RowFigures(why, counts=counts)
-    return replace(found, depth=KeyframeFigures.mean(depths), counts=counts)
+    assert rendered.truth.surface is not None
+    ratio, truth = (np.concatenate(arrays) for arrays in zip(*((d.ratio, d.truth) for d in depths), strict=True))
+    mean = KeyframeFigures.mean([d.figures for d in depths])
+    curves = bands(ratio, truth), front(placed, rendered.truth.surface)
+    return replace(found, depth=mean, counts=counts, bands=curves[0], front=curves[1])
 
 
-def _depths(made: DenseMap, rendered: Rendered, known: Mapping[str, DepthPrediction]) -> list[KeyframeFigures]:
+def _placed(made: Sequence[DenseMap], rendered: Rendered) -> list[tuple[DenseMap, Similarity]]:
+    """The dense maps that can be brought to mm, each by its own Sim(3)."""
+    found = []
+    for m in made:
+        with suppress(InputError):
+            aligned = align_trajectory(keyframe_trajectory(m.submap), rendered.truth.poses)
+            found.append((m, aligned.true_from_map))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Depth:
+    """A keyframe's depth p against truth q: figures, and of every fourth pixel p / q (n,) and q (n,) [mm]."""
+
+    figures: KeyframeFigures
+    ratio: np.ndarray
+    truth: np.ndarray
+
+
+def _depths(made: DenseMap, mm: float, rendered: Rendered, known: Mapping[str, DepthPrediction]) -> list[_Depth]:
     """Of each aligned keyframe of a submap, its depth brought to mm by the submap's Sim(3) alone: AbsRel, RMSE, and
     the error of its scale, |median p / q - 1|."""
-    try:
-        mm = align_trajectory(keyframe_trajectory(made.submap), rendered.truth.poses).true_from_map.scale
-    except InputError:
-        return []
     found = []
     for keyframe, alignment in zip(made.submap.keyframes, made.alignments, strict=True):
         frame = rendered.frames.by_number(keyframe.number)
@@ -327,6 +359,9 @@ def _depths(made: DenseMap, rendered: Rendered, known: Mapping[str, DepthPredict
         if alignment.ok:
             depth = compare_depth(alignment.applied(known[frame.name]).scaled(mm), frame)
             errors = depth.errors(["none"])
-            ratio = np.median(depth.predicted[depth.valid] / depth.truth[depth.valid])
-            found.append(KeyframeFigures(errors["abs_rel_none"], errors["rmse_mm_none"], abs(float(ratio) - 1)))
+            truth = depth.truth[depth.valid]
+            ratio = depth.predicted[depth.valid] / truth
+            scale = abs(float(np.median(ratio)) - 1)
+            figures = KeyframeFigures(errors["abs_rel_none"], errors["rmse_mm_none"], scale)
+            found.append(_Depth(figures, *(each[::4].astype(np.float32) for each in (ratio, truth))))
     return found

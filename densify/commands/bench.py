@@ -1,5 +1,5 @@
-"""The verb bench: a run of the benchmark, `bench compare A B`, `bench estimators`, `bench per-frame`. Thin: arguments
-in, files out."""
+"""The verb bench: a run of the benchmark, `bench compare A B`, `bench estimators`, `bench per-frame`, `bench
+completion`. Thin: arguments in, files out."""
 
 from __future__ import annotations
 
@@ -13,6 +13,15 @@ from typing import Annotated
 
 from densify.bench import per_frame
 from densify.bench.cases import USUAL_CASES, Case
+from densify.bench.completion.external import external_folders
+from densify.bench.completion.pictures import page as completion_page
+from densify.bench.completion.run import RESERVED, completed_cells
+from densify.bench.completion.scenes import ERRORS, Errors
+from densify.bench.completion.scenes import IMAGE_SIZE as SIZES
+from densify.bench.completion.tables import notes as completion_notes
+from densify.bench.completion.tables import record as completion_record
+from densify.bench.completion.tables import tables as completion_tables
+from densify.bench.curve_pictures import bench_picture
 from densify.bench.estimators import (
     NO_LIBRARY,
     EstimatorsConfig,
@@ -27,9 +36,10 @@ from densify.bench.spoilt import SpoiltFrame, spoilt_frames, spoilt_tables
 from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, ModelSources, cells_of, load_models, predicted
 from densify.config import DensifyConfig, OfflineConfig, Recipe
-from lightdepth.checkpoint import DEFAULT_CHECKPOINT
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, ModelSource
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
+from lightdepth.errors import InputError
 from lightdepth.files.images import write_image
 from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
@@ -43,11 +53,13 @@ from lightdepth.reporting.run import Run, plain, recorded, run_folder
 
 
 def bench(argv: list[str]) -> int:
-    """The built-in benchmark on synthetic colons; `bench compare A B`; `bench estimators`; `bench per-frame`."""
+    """The built-in benchmark on synthetic colons; `bench compare A B`; `bench estimators`; `bench per-frame`; `bench
+    completion`."""
     of: dict[str, Callable[..., None]] = {
         "compare": compare_runs,
         "estimators": compare_estimators,
         "per-frame": compare_per_frame,
+        "completion": compare_completions,
     }
     if argv and argv[0] in of:
         of[argv[0]](**parse(of[argv[0]], f"bench {argv[0]}", argv[1:]))
@@ -69,11 +81,11 @@ def run(
     overwrite: bool = False,
     resume: bool = False,
 ) -> None:
-    """Synthetic colons made from seeds, judged row by row (--help of bench compare A B, bench estimators and bench
-    per-frame says more).
+    """Synthetic colons made from seeds, judged row by row (--help of bench compare A B, bench estimators, bench
+    per-frame and bench completion says more).
 
     Args:
-        output: Folder to make, with bench.json and bench.md.
+        output: Folder to make, with bench.json, bench.md, and bench.png (error against coverage and by distance).
         size: How much is measured: small, two short sequences, minutes; full, eight, and one ten times as long (the
             screening), up to an hour.
         first_seed: Number that seeds the first scene; the others count on from it. Bundled checkpoints were trained on
@@ -124,6 +136,9 @@ def run(
         _write_json(folder, "bench.json", found)
         text = "\n".join([*(t.markdown() for t in tables(found)), *(f"{note}\n" for note in notes(found))])
         (folder.folder / "bench.md").write_text(text, encoding="utf-8", errors="backslashreplace")
+        picture = bench_picture(found["cells"])
+        if picture is not None:
+            (folder.folder / "bench.png").write_bytes(picture)
         folder.log(text)
 
 
@@ -258,6 +273,63 @@ def compare_per_frame(
         _write_json(folder, "per-frame.json", found)
         (folder.folder / "per-frame.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         write_image(folder.folder / "colons.png", per_frame.contact_sheet(sequences))
+        folder.log(text)
+
+
+def compare_completions(
+    output: Path = Path("runs/completion"),
+    size: Size = "small",
+    predicting: Group[ModelSource] = ModelSource(),
+    errors: tuple[Errors, ...] = ERRORS,
+    external: tuple[str, ...] = (),
+    inputs: bool = False,
+    image_size: Annotated[tuple[int, int] | None, at_least(32, up_to=10_000)] = None,
+    method: Group[OfflineConfig] = OfflineConfig(),
+    overwrite: bool = False,
+    resume: bool = False,
+) -> None:
+    """Dense depth from the same sparse points and the same prediction, completed in several ways, on six colons.
+
+    Args:
+        output: Folder to make, with completion.json and .md, and report.html with curves and pictures.
+        size: How large the keyframes are: small, 160 by 128 pixels, some ten minutes; full, 320 by 256, four times as
+            long.
+        errors: How 30 % of the map's points are wrong: independent (each on its own), coherent (one side of the wall,
+            in a SLAM that errs as a real one), or both.
+        external: Completions of other programs, each NAME=FOLDER, a row of that name: FOLDER/SCENE/ERRORS/000012.npz
+            holds one array, distance or depth, of keyframe 12, in map units (--inputs true writes what they are made
+            from).
+        inputs: Whether to write what another program completes, one .npz for each keyframe, into inputs/.
+        image_size: Width and height of the keyframes, pixels, in place of those of the size. A larger one shows finer
+            detail and takes longer.
+        overwrite: Replace a run made before.
+        resume: Go on with the run that was stopped there, as it was begun; colons that were judged are not made again.
+    """
+    arguments = recorded(
+        predicting,
+        method,
+        output=output,
+        size=size,
+        errors=errors,
+        external=external,
+        inputs=inputs,
+        image_size=image_size,
+    )
+    if not errors or len(set(errors)) < len(errors):
+        raise InputError("--errors", f"{list(errors)}", "expected at least one, and none twice")
+    folders = external_folders(external, RESERVED)
+    (model,) = load_models((predicting.checkpoint,), predicting.device)
+    config = DensifyConfig(**vars(method))
+    with run_folder(output, "bench completion", arguments, overwrite, resume) as folder:
+        folder.hash_inputs(checkpoint=Path(predicting.checkpoint), **folders)
+        cells, pictures = completed_cells(folder, model, config, errors, folders, inputs, image_size or SIZES[size])
+        found = {**completion_record(cells), "config": config, "versions": versions(), "revision": git_revision()}
+        _write_json(folder, "completion.json", found)
+        text = "\n".join(
+            [*(t.markdown() for t in completion_tables(cells)), *(f"{n}\n" for n in completion_notes(cells))]
+        )
+        (folder.folder / "completion.md").write_text(text, encoding="utf-8", errors="backslashreplace")
+        completion_page(cells, pictures).write(folder.folder / "report.html")
         folder.log(text)
 
 

@@ -179,6 +179,7 @@ class SurfaceErrors:
             precision=precision,
             recall=recall,
             f_score={key: _harmonic_mean(precision[key], recall[key]) for key in precision},
+            chamfer_mm=float(self.accuracy.mean() + self.completeness.mean()) / 2,
         )
 
 

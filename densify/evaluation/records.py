@@ -67,6 +67,8 @@ class SurfaceFigures:
     """share of the true points within a distance of the model, by the distance"""
     f_score: Mapping[str, float]
     """harmonic mean of precision and recall, by the distance"""
+    chamfer_mm: float
+    """mean of the mean distances both ways: from the model's points to the truth, and back"""
 
 
 @dataclass(frozen=True)
@@ -142,6 +144,9 @@ class TrajectoryFigures:
     """over all poses, each after its own submap's Sim(3)"""
     rms_ate_se3_mm: float | None
     """over all poses, each after its own submap's SE(3); None where the scale of no map is known"""
+    rms_rpe_mm: float
+    """over all steps from one pose to the next, after Sim(3): length of the difference between the step and the true
+    one"""
     climb_ate_mm: float | None
     """CLiMB's mean of the submaps', weighted by their poses; None where no submap has enough"""
     climb_submaps: int

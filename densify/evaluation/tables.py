@@ -123,6 +123,7 @@ def trajectory_table(results: Mapping[str, MapsJudged], suite: Suite | None = No
         "KF time ms": lambda t: t.ms_per_keyframe,
         "RMS ATE mm, Sim(3)": lambda t: t.rms_ate_mm,
         "RMS ATE mm, SE(3)": lambda t: t.rms_ate_se3_mm,
+        "RMS RPE mm, Sim(3)": lambda t: t.rms_rpe_mm,
         "ATE mm, CLiMB": lambda t: t.climb_ate_mm,
         "Frames localised %": lambda t: None if t.localised_share is None else 100 * t.localised_share,
         "# Submaps aligned": lambda t: t.submaps_aligned,
@@ -152,9 +153,9 @@ def surface_table(results: Mapping[str, MapsJudged], suite: Suite | None = None)
 
 
 def completeness_table(results: Mapping[str, MapsJudged], suite: Suite | None = None) -> Table:
-    """What the paper's tables leave out: distance to the true mesh, completeness, F-score."""
+    """What the paper's tables leave out: Chamfer distance, distance to the true mesh, completeness, F-score."""
     suite = suite or alone(list(results))
-    figures: dict[str, _SurfaceFigure] = {}
+    figures: dict[str, _SurfaceFigure] = {"Chamfer": lambda f: f.chamfer_mm}
     for title, distance in _DISTANCES.items():
         figures[f"{title} to true mesh"] = partial(_to_mesh, distance)
         figures[f"{title} from truth (completeness)"] = partial(_completeness, distance)

@@ -134,13 +134,15 @@ def _read(file: Path, reader: Reader) -> Trajectory:
 @dataclass(frozen=True, eq=False)
 class AlignedTrajectory:
     """A submap's poses that have a true one, brought to it: numbers (n,), ATE (n,) [mm] after Sim(3), and after SE(3)
-    where the map's scale is known; how far the sideways motion agrees."""
+    where the map's scale is known; the error (n - 1,) [mm] of the steps from one to the next (RPE of centres) after
+    Sim(3); how far the sideways motion agrees."""
 
     id: int
     numbers: np.ndarray
     true_from_map: Similarity
     ate_sim3: np.ndarray
     ate_se3: np.ndarray | None
+    rpe: np.ndarray
     sideways: float
 
     def summary(self) -> AlignedFigures:
@@ -171,7 +173,8 @@ def align_trajectory(
     if mm_per_unit is not None:
         rigid = ate(mm_per_unit * centers, true, fit_similarity(mm_per_unit * centers, true, with_scale=False))
     agreement = sideways_agreement(centers, true, sim3)
-    return AlignedTrajectory(trajectory.id, numbers, sim3, ate(centers, true, sim3), rigid, agreement)
+    steps = np.linalg.norm(np.diff(sim3.apply(centers) - true, axis=0), axis=1)
+    return AlignedTrajectory(trajectory.id, numbers, sim3, ate(centers, true, sim3), rigid, steps, agreement)
 
 
 def trajectory_summary(
@@ -194,6 +197,7 @@ def trajectory_summary(
         poses=sum(len(a.numbers) for a in aligned),
         rms_ate_mm=rms(np.concatenate([a.ate_sim3 for a in aligned])),
         rms_ate_se3_mm=rms(np.concatenate(rigid)) if rigid else None,
+        rms_rpe_mm=rms(np.concatenate([a.rpe for a in aligned])),
         climb_ate_mm=float(np.average([rms(a.ate_sim3) for a in counted], weights=poses)) if counted else None,
         climb_submaps=len(counted),
         climb_rule=f"mean over submaps of at least {CLIMB_POSES} poses, weighted by their number",

@@ -159,6 +159,12 @@ PAGES = {
             "lightdepth bench per-frame -o runs/mine --colons runs/per-frame/colons --checkpoints '[mine.safetensors]'",
         )
     ),
+    "bench completion": Page(
+        (
+            "lightdepth bench completion -o runs/completion --inputs true",
+            "lightdepth bench completion -o runs/beside --external '[mine=runs/mine]'",
+        )
+    ),
     "measure": Page(
         (
             "lightdepth measure runs/dense --points '[[0, 0, 30], [4, 2, 41]]' --mm-per-unit 3.1",
