@@ -250,6 +250,12 @@ def test_a_difference_is_clear_where_its_mean_is_larger_than_its_spread_over_the
     assert not clear(np.array([0.5]))
 
 
+def test_a_table_of_trainings_on_sequences_names_no_colons():
+    table = table_of(base=(0.8,))
+    text = markdown(replace(table, tube=replace(table.tube, scenes=0)))
+    assert "the sequences of its settings" in text and f"{table.tube.frames} frames each, " not in text
+
+
 @pytest.mark.parametrize("base", [result("base", 3, 0.8), result("base", 9, 0.8, failed="it went nowhere")])
 def test_a_row_without_a_seed_in_common_with_the_first_is_shown_with_nothing_to_compare(base, tmp_path):
     rows = (Row("base"), Row("other", part="reference", seeds=(9,)))

@@ -222,7 +222,10 @@ def markdown(table: AblationTable) -> str:
 def _head(table: AblationTable) -> str:
     seeds = sorted({r.seed for r in table.results})
     tube, (width, height) = table.tube, table.size
-    trained = ", ".join(_span(colon_seeds(tube, seed)[0]) for seed in seeds)
+    colons = "the sequences of its settings, "
+    if tube.scenes:
+        trained = ", ".join(_span(colon_seeds(tube, seed)[0]) for seed in seeds)
+        colons = f"{tube.scenes} {tube.family} colons (seeds {trained}),\n{tube.frames} frames each, "
     judged = "\n".join(f"- {c.name}: seeds {_span(c.seeds)}, {c.frames} frames each" for c in table.judged)
     steps = next(r.steps for r in table.results)
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
@@ -233,9 +236,8 @@ Made by `{command}`
 (program of revision {revision}); not to be edited.
 
 Every row is the first one with one change, trained anew with seeds {", ".join(map(str, seeds))}:
-{tube.scenes} {tube.family} colons (seeds {trained}),
-{tube.frames} frames each, {width}x{height} pixels, {steps} steps of {table.batch_size} frames unless the row says
-otherwise. The rows of a seed share colons and order. Judged on colons that no row saw, by depth along the axis, one
+{colons}{width}x{height} pixels, {steps} steps of {table.batch_size} frames unless the row says
+otherwise. The rows of a seed share frames and order. Judged on colons that no row saw, by depth along the axis, one
 median scale per frame, ray_z > .15, depth < 100 mm, inside the mask:
 
 {judged}
