@@ -26,13 +26,15 @@ COLUMNS = {
     "rms_mm": "RMS Acc. mm",
     "median_mm": "MedA Acc. mm",
     "completeness_median_mm": "Completeness mm",
+    "sharp_edges": "Edges over 30 deg",
     "depth_abs_rel": "Depth AbsRel",
     "scale_error": "Scale error",
     "unaligned_share": "KF left out",
 }
 UNITS = (
     "mm; shares, depth_abs_rel and scale_error of 1. rms_mm, median_mm, p90_mm: from each model point to the closest "
-    "true point; completeness: from each true point to the closest model point; depth_*: of the aligned keyframes' "
+    "true point; completeness: from each true point to the closest model point; sharp_edges: share of "
+    "the mesh's edges at which it turns by more than 30 degrees; depth_*: of the aligned keyframes' "
     "depth, mean over keyframes; scale_error: |median of predicted / true depth - 1| of a keyframe, mean over "
     "keyframes; keyframes are left out where their alignment is not trusted"
 )

@@ -67,6 +67,8 @@ class SurfaceFigures:
     """share of the true points within a distance of the model, by the distance"""
     f_score: Mapping[str, float]
     """harmonic mean of precision and recall, by the distance"""
+    sharp_edges: float | None = None
+    """share of the mesh's edges at which it turns by more than 30 degrees; None where it has no triangles"""
 
 
 @dataclass(frozen=True)
@@ -196,6 +198,8 @@ class TruthFigures:
     """median distance between neighbouring points"""
     mesh: str | None
     """where the true mesh is from"""
+    sharp_edges: float | None = None
+    """share of the true mesh's edges at which it turns by more than 30 degrees"""
 
 
 @dataclass(frozen=True)

@@ -48,9 +48,9 @@ class FusionConfig:
     """Least number of keyframes that must have seen a piece of surface for it to be kept; the recipe paper keeps all.
     More leave out what few have seen."""
     front: Annotated[float, SHARE] = 0.3
-    """Weight, from 0 to 1, that a keyframe keeps where the wall is, by its depth, at least the truncation farther on; it
-    falls steadily from the wall to there. A larger one cuts away more of what keyframes look through, with steps where
-    they disagree; 1 cuts with full weight."""
+    """Weight, from 0 to 1, that a keyframe keeps where the wall is, by its depth, farther on by the truncation or more;
+    it falls steadily from the wall to there. A larger one cuts away more of what keyframes look through, with steps
+    where they disagree; 1 cuts with full weight."""
     far: Annotated[float, above(0)] = 2.0
     """Farthest distance from a keyframe that is fused, as a multiple of the distance within which 90 % of its inliers
     lie. A larger one reaches farther, where depth is worse."""
