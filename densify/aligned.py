@@ -32,7 +32,8 @@ class AlignedKeyframe:
     alone: Alignment | None = None
     """its one scale, from before it was bent; None where nothing was"""
     stays: np.ndarray | None = None
-    """share (h, w) in {0, 1} of its pixels, coarsely, that no nearer keyframe contradicts; None is all of them"""
+    """share (h, w) in [0, 1], coarsely, of its weight that each pixel keeps where nearer keyframes contradict it; None
+    is all of it"""
 
     def unread(self, reason: str) -> AlignedKeyframe:
         """The keyframe where its image cannot be read (any more)."""

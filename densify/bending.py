@@ -2,12 +2,13 @@
 
 Notation: b predicted distance, x pixel over the image's size, in [0, 1]²; d = b exp(f) the bent distance, with
 
-    f(x, b) = phi(x, b)' w,   phi = (1, log b - log b0, g_1(x), ..., g_m(x)),
+    f(x, b) = phi(x, b)' w,   phi = (1, log b - log b0, g_i(x), h_k(b), h_k(b) c_j(x)),
 
-b0 the median predicted distance of the keyframe and g Gaussian bumps on regular grids over the image, as wide as the
-step of their grid, less their mean over the image. So w[0] is the log of the keyframe's scale: the mean of f over the
-image, but for the slope. The others are pulled to 0 by a ridge, each with the
-deviation that its part of the field is expected to have. A field is as smooth as its finest grid.
+b0 the median predicted distance of the keyframe; g and c Gaussian bumps on regular grids over the image, as wide as the
+step of their grid, less their mean over the image; h Gaussian bumps over log b, the layers, a step `reach` apart about
+log b0. So near and far wall in one part of the image are bent each by its own points, and far from all points in log
+distance the field returns to w[0], the log of the keyframe's scale, and the slope. All but w[0] are pulled to 0 by a
+ridge, each with the deviation that its part of the field is expected to have. A field is as smooth as its finest grid.
 """
 
 from __future__ import annotations
@@ -34,13 +35,27 @@ class BendingConfig:
     grids: Annotated[tuple[int, ...], at_least(2, up_to=64)] = (5,)
     """Number n of smooth bumps across and down the image that make up the bend, n x n of them, at least 2; several
     numbers lay several such grids over each other. More let depth bend in finer detail."""
-    slope_deviation: Annotated[float, at_least(0)] = 0.3
+    slope_deviation: Annotated[float, at_least(0)] = 0.25
     """How strongly the factor on distance is expected to change with distance itself (standard deviation, a ratio:
     change of the factor's log per change of the log of predicted distance), besides over the image; a soft limit, 0
     for no such change. A larger one lets near wall be stretched against far wall more freely."""
     bump_deviation: Annotated[float, above(0)] = 0.1
     """Expected size (standard deviation) of each bump of the bend, in log distance (0.1 is 10 %), above 0. A larger one
     lets depth bend more strongly."""
+
+    layers: Annotated[int, at_least(0, up_to=64)] = 7
+    """Number of smooth bumps over log distance, `reach` apart, around a keyframe's median predicted distance, that the
+    bend has besides those over the image: near wall and far wall bend each by its own points. More cover nearer and
+    farther wall; 0 leaves them out."""
+    columns: Annotated[int, at_least(0, up_to=64)] = 3
+    """Number n of bumps across and down the image, n x n, that each layer has of its own, so that what is near and what
+    is far in one part of the image bend apart. More bend in finer detail and take longer; 0 leaves them out."""
+    reach: Annotated[float, above(0)] = 0.35
+    """Step, in log distance (0.35 is a factor of 1.4), from layer to layer, and how far wall has to be from points in
+    distance to keep the network's own shape. A larger one makes a smoother bend, which reaches farther from points."""
+    layer_deviation: Annotated[float, above(0)] = 0.1
+    """Expected size (standard deviation) of each bump of a layer, in log distance (0.1 is 10 %). A larger one lets near
+    wall bend more strongly against far wall."""
 
     @property
     def precision(self) -> np.ndarray:
@@ -49,7 +64,8 @@ class BendingConfig:
             return np.zeros(1)
         slope = [self.slope_deviation**-2] if self.slope_deviation else []
         bumps = [np.full(n * n, self.bump_deviation**-2) for n in self.grids]
-        return np.concatenate([[0.0], slope, *bumps])
+        layers = np.full(self.layers * (1 + self.columns**2), self.layer_deviation**-2)
+        return np.concatenate([[0.0], slope, *bumps, layers])
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,8 +81,15 @@ class Bend(Brief):
 
     @property
     def scale(self) -> float:
-        """Map units per predicted unit where the field is zero."""
-        return float(np.exp(self.weights[0]))
+        """Map units per predicted unit at the median distance, in the mean over the image."""
+        middle, first = np.array([self.log_middle]), len(self.weights) - self._in_layers
+        layers = [self.weights[first + k] * self._layer(middle, k)[0] for k in range(self.config.layers)]
+        return float(np.exp(self.weights[0] + sum(layers if self.config.on else [])))
+
+    @property
+    def _in_layers(self) -> int:
+        """How many of the weights, the last ones, are those of layers."""
+        return self.config.layers * (1 + self.config.columns**2)
 
     def basis(self, x: np.ndarray, log_distance: np.ndarray) -> np.ndarray:
         """phi (n, m) at x (n, 2) in [0, 1]² and log predicted distance (n,)."""
@@ -78,7 +101,20 @@ class Bend(Brief):
         for n in self.config.grids:
             across, down, mean = _bumps(x[:, 0], n), _bumps(x[:, 1], n), _mean(n)
             parts.append((down[:, :, None] * across[:, None, :] - np.outer(mean, mean)).reshape(len(x), -1))
+        count, n = self.config.layers, self.config.columns
+        if count:
+            layers = np.stack([self._layer(log_distance, k) for k in range(count)], 1)
+            across, down, mean = _bumps(x[:, 0], n), _bumps(x[:, 1], n), _mean(n)
+            own = (down[:, :, None] * across[:, None, :] - np.outer(mean, mean)).reshape(len(x), 1, -1)
+            parts += [layers, (layers[:, :, None] * own).reshape(len(x), -1)]
         return np.concatenate(parts, 1)
+
+    def _layer(self, log_distance: np.ndarray, k: int) -> np.ndarray:
+        """The bump of layer k at log distances, of their shape and precision."""
+        middle = self.log_middle + (k - (self.config.layers - 1) / 2) * self.config.reach
+        dtype = log_distance.dtype.type
+        result: np.ndarray = np.exp(dtype(-0.5) * ((log_distance - dtype(middle)) / dtype(self.config.reach)) ** 2)
+        return result
 
     def at(self, pixels: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """f (n,) at pixels (n, 2) with predicted distance (n,)."""
@@ -102,6 +138,12 @@ class Bend(Brief):
             weights = self.weights[used : used + n * n].reshape(n, n)
             field += (down @ weights @ across.T - _mean(n) @ weights @ _mean(n)).astype(np.float32)
             used += n * n
+        count, n = self.config.layers, self.config.columns
+        down, across = (_bumps((np.arange(size) + 0.5) / size, n) for size in (height, width))
+        own = self.weights[used + count :].reshape(count, n, n)
+        for k in range(count):
+            total = down @ own[k] @ across.T - _mean(n) @ own[k] @ _mean(n) + self.weights[used + k]
+            field += self._layer(log_distance, k) * total.astype(np.float32)
         return field
 
     def applied(self, prediction: DepthPrediction) -> DepthPrediction:

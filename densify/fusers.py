@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from densify.aligned import AlignedKeyframe
 from densify.alignment import Alignment
 from densify.config import DensifyConfig, MethodConfig
-from densify.contradiction import without
+from densify.contradiction import share_at
 from densify.coverage import Given, with_contributions
 from densify.dense_map import DenseMap
 from densify.fusion.plain import PlainTsdf, undistorted
@@ -40,11 +39,17 @@ def fuser_for(submap: Submap, config: DensifyConfig) -> Fuser:
 
 
 def view_to_fuse(
-    alignment: Alignment, prediction: DepthPrediction, image: np.ndarray, config: MethodConfig
+    alignment: Alignment,
+    prediction: DepthPrediction,
+    image: np.ndarray,
+    config: MethodConfig,
+    stays: np.ndarray | None = None,
 ) -> SurfaceView:
-    """A keyframe's depth in map units, rectified, as far as the fusion reaches."""
+    """A keyframe's depth in map units, rectified, as far as the fusion reaches. `stays` (h, w), coarse, is the share of
+    its weight that a pixel keeps; None is all of it."""
     reach = config.fusion.far * alignment.range_90
-    return surface_view(alignment.applied(prediction), image, config.rectify, reach)
+    share = None if stays is None else share_at(stays, prediction.valid.shape)
+    return surface_view(alignment.applied(prediction), image, config.rectify, reach, share)
 
 
 class FullFuser:
@@ -57,9 +62,7 @@ class FullFuser:
     def add(self, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
         assert seen.frame is not None and seen.prediction is not None
         prediction = seen.prediction
-        if aligned.stays is not None:
-            prediction = replace(prediction, valid=without(prediction.valid, aligned.stays))
-        view = view_to_fuse(aligned.alignment, prediction, seen.frame.image, self._config)
+        view = view_to_fuse(aligned.alignment, prediction, seen.frame.image, self._config, aligned.stays)
         self._volume.integrate(view, aligned.keyframe.cam_from_map)
         self._given[aligned.keyframe.name] = Given.of(view, prediction)
 

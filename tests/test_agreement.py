@@ -12,7 +12,7 @@ from colons import EXACT, colon, slam, truth
 
 from densify.agreement import AgreementConfig, View, agree
 from densify.bending import BendingConfig
-from densify.contradiction import ContradictionConfig, uncontradicted, without
+from densify.contradiction import ContradictionConfig, share_at, uncontradicted
 from lightdepth.observations import observed_distances
 from lightdepth.prediction import DepthPrediction
 from lightdepth.robust import lmeds_scale
@@ -114,7 +114,7 @@ def test_what_floats_before_a_nearer_view_s_surface_is_contradicted_and_truth_is
         views = views_of([first, *right[1:]])
         bends = agree(views, shared, still, BendingConfig())
         stays = uncontradicted(views, bends, shared, config)
-        kept = [without(p.valid, s) for p, s in zip([first, *right[1:]], stays, strict=True)]
+        kept = [p.valid * share_at(s, p.valid.shape) for p, s in zip([first, *right[1:]], stays, strict=True)]
         assert low <= kept[0][patch].mean() <= high
         assert np.mean([k.sum() / p.valid.sum() for k, p in zip(kept, right, strict=True)]) > 0.9
 

@@ -161,7 +161,7 @@ def test_rounds_end_with_the_tolerance_or_their_number_and_off_does_nothing():
 
     begun = weights(on=False)
     assert begun[0] == np.log(1.7) and not begun[1:].any() and np.array_equal(weights(rounds=0), begun)
-    one, two, many = weights(rounds=1, tolerance=0), weights(rounds=2, tolerance=0), weights(rounds=60, tolerance=1e-9)
+    one, two, many = weights(rounds=1, tolerance=0), weights(rounds=2, tolerance=0), weights(rounds=150, tolerance=1e-9)
     assert np.abs(one - begun).max() > np.abs(two - one).max() > 0
     assert np.array_equal(weights(rounds=9, tolerance=9.0), one)
     np.testing.assert_allclose(weights(rounds=200, tolerance=1e-12), many, atol=1e-7)

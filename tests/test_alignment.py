@@ -181,7 +181,7 @@ def test_a_threshold_that_is_none_is_refused():
 
 def test_a_bend_that_deserves_no_trust_is_left_out_and_the_scale_stays():
     pairs = observed(wrong=0.3, noise=0.01)
-    config = BendingConfig(grids=(2,))
+    config = BendingConfig(grids=(2,), layers=0)
     flat = Bend(config, 3.0, np.array([np.log(0.3), 0, 0, 0, 0, 0]), (100, 100))
     before = align("1", pairs, AlignmentConfig())
     same = bent(before, flat, pairs, AlignmentConfig())
@@ -213,7 +213,7 @@ def test_the_90th_percentile_of_distance_is_the_inliers_and_wrong_points_do_not_
 
 def test_a_bend_s_inliers_are_within_t_sigma_of_the_logarithm_and_its_sigma_is_a_length():
     pairs = observed(wrong=0.2, noise=0.01)
-    flat = Bend(BendingConfig(grids=(2,)), 3.0, np.array([np.log(0.3), 0, 0, 0, 0, 0]), (100, 100))
+    flat = Bend(BendingConfig(grids=(2,), layers=0), 3.0, np.array([np.log(0.3), 0, 0, 0, 0, 0]), (100, 100))
     found = bent(align("1", pairs, AlignmentConfig()), flat, pairs, AlignmentConfig())
     residual = np.abs(np.log(pairs.mapped / pairs.predicted / 0.3))
     sigma = 1.4826 * np.median(residual)

@@ -155,11 +155,11 @@ def test_an_empty_surface_has_no_coverage():
 def test_a_keyframe_says_what_share_it_gave_and_with_what_weight():
     prediction = sphere(lens("fisheye", 80, 64)).prediction()
     image = np.full((64, 80, 3), 0.5, np.float32)
-    whole = contribution(surface_view(prediction, image, RectifyConfig()), prediction)
+    whole = contribution(surface_view(prediction, image, RectifyConfig(feather=0.0)), prediction)
     assert whole.fused_share == 1 and whole.fused_weight == pytest.approx(1, abs=0.01) and np.isnan(whole.views)
-    dark = surface_view(prediction, 0 * image, RectifyConfig())
+    dark = surface_view(prediction, 0 * image, RectifyConfig(feather=0.0))
     assert contribution(dark, prediction).fused_weight == pytest.approx(0.5, abs=0.01)
-    cropped = surface_view(prediction, image, RectifyConfig(field="pinhole"))
+    cropped = surface_view(prediction, image, RectifyConfig(field="pinhole", feather=0.0))
     assert 0.4 < contribution(cropped, prediction).fused_share < 0.7
 
 

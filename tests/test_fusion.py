@@ -24,7 +24,7 @@ def plane(z: float | np.ndarray = 20.0, color: float = 0.5, valid: np.ndarray | 
     rays, everywhere = CAMERA.rays()
     distance = (z / rays[..., 2]).astype(np.float32)
     prediction = DepthPrediction("1", distance, everywhere if valid is None else valid, CAMERA, "plane")
-    return surface_view(prediction, np.full((90, 120, 3), color, np.float32), RectifyConfig())
+    return surface_view(prediction, np.full((90, 120, 3), color, np.float32), RectifyConfig(feather=0.0))
 
 
 def fused(views, poses=None, voxel: float = 0.4, **config) -> Mesh:
@@ -131,6 +131,14 @@ def test_a_vertex_was_seen_by_the_views_that_saw_the_voxel_nearest_to_it(z, view
     assert (mesh.views[middle] == views).all()
 
 
+def test_a_view_that_looks_through_a_wall_moves_it_less_where_the_front_is_soft():
+    """One view has the wall at 20, one with half the weight at 21.8, of a truncation of 2.4: only before it does the
+    second pull."""
+    looks = [plane(20.0), plane(21.8, color=1.0)]
+    hard, soft = (np.median(fused(looks, front=f).vertices[:, 2]) for f in (1.0, 0.3))
+    assert 20.0 < soft < hard - 0.05
+
+
 def test_two_views_that_disagree_meet_by_their_weights():
     assert np.median(fused([plane(20.0), plane(20.6)]).vertices[:, 2]) == pytest.approx(20.3, abs=0.05)
     assert np.median(fused([plane(20.0), plane(20.6, color=1.0)]).vertices[:, 2]) == pytest.approx(20.2, abs=0.04)
@@ -197,7 +205,9 @@ def by_hand(view: SurfaceView, pose: np.ndarray, voxel: float, places: np.ndarra
     pixels = view.table.look_up(origins, offsets)
     normal, tau = np.moveaxis(view.planes[pixels], -1, 1), np.float32(6 * voxel)
     s = normal[:, 3] - normal[:, 0] * points[:, 0] - normal[:, 1] * points[:, 1] - normal[:, 2] * points[:, 2]
-    weight = np.rint(view.weights[pixels] * np.clip(1 + s / tau, 0, 1)).astype(int)
+    front = FusionConfig().front
+    fading = np.minimum(np.clip(1 + s / tau, 0, 1), 1 - (1 - front) * np.clip(s / tau, 0, 1))
+    weight = np.rint(view.weights[pixels] * fading).astype(int)
     near = (np.abs(s) < 2 * voxel) & (weight > 0)
     return {
         "_weight": weight,

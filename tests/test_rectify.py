@@ -21,7 +21,7 @@ C3VD = lens("c3vd", 100, 80)
 LENSES = pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, C3VD], ids=["pinhole", "fisheye", "c3vd"])
 
 
-STEEP = RectifyConfig(max_slope=20)
+STEEP = RectifyConfig(max_slope=20, feather=0.0)
 
 
 def view_of(prediction: DepthPrediction, config: RectifyConfig = RectifyConfig(), **given) -> SurfaceView:
@@ -221,6 +221,24 @@ def test_the_weight_falls_with_the_slant():
     np.testing.assert_allclose(found[valid], FULL * cosine[valid], atol=1.0)
 
 
+def test_weights_rise_from_nothing_at_the_border_of_what_the_image_shows_to_full_within_the_feather():
+    facing = replace(sphere(PINHOLE).prediction(), valid=np.arange(120)[None] < np.full((90, 1), 100))
+    weight = weights(view_of(facing, RectifyConfig(feather=0.2)), PINHOLE) / FULL  # over 18 pixels
+    middle = weight[45]
+    assert 0 < middle[0] < 0.1 and middle[20:80].min() > 0.99 and 0 < middle[99] < 0.1 and not middle[100:].any()
+    assert np.abs(np.diff(middle[:100])).max() < 0.07  # no step
+    assert weights(view_of(facing, RectifyConfig(feather=0.0)), PINHOLE)[45, :100].min() > 0.99 * FULL
+
+
+def test_a_pixel_that_keeps_none_of_its_weight_is_not_fused_and_one_that_keeps_half_weighs_half():
+    share = np.repeat(np.float32([[0.0, 0.5, 1.0]]), 40, 1).repeat(90, 0)
+    config = RectifyConfig(feather=0.0)
+    weight = weights(view_of(sphere(PINHOLE).prediction(), config, share=share), PINHOLE) / FULL
+    assert not weight[:, :40].any()
+    np.testing.assert_allclose(weight[:, 41:80], 0.5, atol=0.01)
+    np.testing.assert_allclose(weight[:, 81:], 1.0, atol=0.01)
+
+
 def test_a_wall_seen_at_less_than_six_degrees_is_left_out():
     scene: Scene = slanted_plane(PINHOLE, normal=(1.0, 0.0, -0.35))
     cosine = -(scene.normals * scene.rays)[0].sum(0).numpy()
@@ -236,7 +254,7 @@ def test_dark_saturated_and_uncertain_pixels_weigh_little_and_are_not_lost():
     image[:, :30], image[:, 30:60] = 0.004, (1.0, 0.3, 0.2)
     uncertain = np.full((90, 120), 1e-3, np.float32)
     uncertain[:, 90:] = 0.15
-    view = surface_view(replace(prediction, uncertainty=uncertain), image, RectifyConfig())
+    view = surface_view(replace(prediction, uncertainty=uncertain), image, RectifyConfig(feather=0.0))
     weight = weights(view, PINHOLE) / FULL
     assert weight[:, 60:90].min() > 0.99
     assert weight[:, :30].min() > 0 and weight[:, :30].max() < 0.7
@@ -245,7 +263,7 @@ def test_dark_saturated_and_uncertain_pixels_weigh_little_and_are_not_lost():
 
 
 def test_the_light_s_weight_is_whole_between_its_limits():
-    config = RectifyConfig(dark=0.1, bright=0.9, unlit=0.2)
+    config = RectifyConfig(dark=0.1, bright=0.9, unlit=0.2, feather=0.0)
     np.testing.assert_allclose(
         light_weight(np.array([0, 0.05, 0.1, 0.5, 0.9, 0.95, 1]), config), [0.2, 0.6, 1, 1, 1, 0.6, 0.2]
     )

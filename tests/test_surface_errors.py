@@ -201,7 +201,7 @@ IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 def figures(judged) -> dict[str, float]:
     """Every number of the sparse model, flat."""
     found = judged.as_dict()["maps"][0]["sparse"]
-    flat = {k: v for k, v in found.items() if not isinstance(v, dict)}
+    flat = {k: v for k, v in found.items() if not isinstance(v, dict) and v is not None}
     return flat | {f"{k}/{n}": v for k, inner in found.items() if isinstance(inner, dict) for n, v in inner.items()}
 
 

@@ -45,8 +45,8 @@ def looks() -> list[tuple[SurfaceView, np.ndarray]]:
     turned[:3, :3] *= np.sign(np.diag(turned[:3, :3]))
     known = np.random.default_rng(0).random((11, 14)) < 0.9
     return [
-        (surface_view(predicted(slanted()), colours(), RectifyConfig()), np.eye(4)),
-        (surface_view(predicted(slanted() + 0.05, known), 1 - colours(), RectifyConfig()), turned),
+        (surface_view(predicted(slanted()), colours(), RectifyConfig(feather=0.0)), np.eye(4)),
+        (surface_view(predicted(slanted() + 0.05, known), 1 - colours(), RectifyConfig(feather=0.0)), turned),
     ]
 
 
@@ -254,7 +254,7 @@ def test_the_plane_of_a_pixel_is_that_through_it_and_its_neighbours_and_weighs_i
     if way_round:  # rows for columns
         distance, valid, image = distance.T, valid.T, image.transpose(1, 0, 2)
         camera = Pinhole(11, 14, 15.0, 14.0, 5.9, 6.2)
-    view = surface_view(predicted(distance, valid, camera), image, RectifyConfig())
+    view = surface_view(predicted(distance, valid, camera), image, RectifyConfig(feather=0.0))
     normals, edge = planes_by_hand(distance, valid, camera)
     rays, known = camera.rays()[0], valid & ~edge
     shape = distance.shape
@@ -280,7 +280,7 @@ def test_a_finer_image_is_averaged_in_whole_squares_over_what_is_known():
     distance, image = 3 + 0.01 * rng.random((4, 5)), rng.uniform(0.2, 0.8, (4, 5, 3)).astype(np.float32)
     valid = np.ones((4, 5), bool)
     valid[0, 0] = valid[2:, 4] = False
-    view = surface_view(predicted(distance, valid, camera), image, RectifyConfig(focal_px=15.0))
+    view = surface_view(predicted(distance, valid, camera), image, RectifyConfig(focal_px=15.0, feather=0.0))
     points = camera.rays()[0] * distance[..., None]
     for k, (rows, columns) in enumerate(
         (np.s_[2 * r : 2 * r + 2], np.s_[2 * c : 2 * c + 2]) for r, c in np.ndindex(2, 3)
@@ -361,14 +361,16 @@ def test_of_a_fisheye_a_pinhole_field_keeps_what_an_undistorted_image_of_its_siz
     distance, config = np.full((22, 30), 3.0), RectifyConfig(field="pinhole", max_slope=100)
     view = surface_view(predicted(distance, fisheye.rays()[1], fisheye), colours(fisheye), config)
     assert np.array_equal(view.weights[:-1].reshape(22, 30) > 0, kept) and 50 < kept.sum() < 600
-    assert (surface_view(predicted(slanted()), colours(), RectifyConfig(field="pinhole")).weights[:-1] > 0).all()
+    assert (
+        surface_view(predicted(slanted()), colours(), RectifyConfig(field="pinhole", feather=0.0)).weights[:-1] > 0
+    ).all()
     with refused(where="field"):
         RectifyConfig(field="fisheye")
 
 
 @pytest.mark.parametrize("channel", range(3))
 def test_dark_and_bright_pixels_weigh_less_and_unsure_ones_by_their_sigma(channel):
-    config = RectifyConfig(dark=0.1, bright=0.8, unlit=0.4, sigma=0.2)
+    config = RectifyConfig(dark=0.1, bright=0.8, unlit=0.4, sigma=0.2, feather=0.0)
     value = np.array([0.0, 0.05, 0.1, 0.5, 0.8, 0.9, 1.0, 1.3])
     np.testing.assert_allclose(light_weight(value, config), [0.4, 0.7, 1, 1, 1, 0.7, 0.4, 0.4])
     image = np.full((11, 14, 3), 0.2, np.float32)

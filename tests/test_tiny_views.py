@@ -93,7 +93,7 @@ def test_a_square_with_a_step_inside_is_left_out_and_light_and_doubt_are_average
     sigma[4:, 8:] = 0.3
     sigma[4:, 9] = 0.0
     given = replace(predicted(distance, camera=camera), uncertainty=sigma)
-    view = surface_view(given, image, RectifyConfig(focal_px=15.0, sigma=0.15))
+    view = surface_view(given, image, RectifyConfig(focal_px=15.0, sigma=0.15, feather=0.0))
     weights = view.weights[:-1].reshape(4, 6)
     lens = Pinhole(6, 4, 15.0, 15.0, 3.0, 2.0)
     assert weights[0].tolist()[1] > 0 and weights[0, 4] == 0 and (weights[2:] > 0).all()

@@ -33,6 +33,7 @@ COLUMNS = {
     "precision.2mm": "Precision 2 mm",
     "recall.2mm": "Recall 2 mm",
     "f_score.2mm": "F 2 mm",
+    "sharp_edges": "Edges over 30 deg",
     "depth_abs_rel": "Depth AbsRel",
     "scale_error": "Scale error",
     "unaligned_share": "KF left out",
@@ -41,8 +42,9 @@ UNITS = (
     "mm; shares, depth_abs_rel and scale_error of 1. rms_mm, median_mm, p90_mm: from each model point to the closest "
     "true point; completeness: from each true point to the closest model point; chamfer_mm: mean of the mean distances "
     "both ways; precision, recall, f_score: shares of model and true points within a distance, and their harmonic "
-    "mean; depth_*: of the aligned keyframes' depth, mean over keyframes; scale_error: |median of predicted / true "
-    "depth - 1| of a keyframe, mean over keyframes; keyframes are left out where their alignment is not trusted"
+    "mean; sharp_edges: share of the mesh's edges at which it turns by more than 30 degrees; depth_*: of the aligned "
+    "keyframes' depth, mean over keyframes; scale_error: |median of predicted / true depth - 1| of a keyframe, mean "
+    "over keyframes; keyframes are left out where their alignment is not trusted"
 )
 ALIGNMENT = (
     "Sim(3) of each submap's keyframes to the true ones (least ATE), for surfaces and depth alike; depth is not "

@@ -286,8 +286,8 @@ def _known(predictions: Mapping[str, DepthPrediction], frame: Frame) -> DepthPre
     return predictions[frame.name]
 
 
-def _model(submap: Submap, **clouds: np.ndarray) -> JudgedMap:
-    return JudgedMap(keyframe_trajectory(submap), clouds)
+def _model(submap: Submap, triangles: np.ndarray | None = None, **clouds: np.ndarray) -> JudgedMap:
+    return JudgedMap(keyframe_trajectory(submap), clouds, triangles)
 
 
 def _trajectory(models: Sequence[JudgedMap], rendered: Rendered) -> SlamFigures:
@@ -317,7 +317,7 @@ def _dense_row(made: Sequence[DenseMap], rendered: Rendered, known: Mapping[str,
     curves of both."""
     placed = _placed(made, rendered)
     depths = [d for m, true_from_map in placed for d in _depths(m, true_from_map.scale, rendered, known)]
-    found = _judged([_model(m.submap, dense=m.vertices) for m in made], rendered, "dense")
+    found = _judged([_model(m.submap, m.triangles, dense=m.vertices) for m in made], rendered, "dense")
     counts = Counts(sum(len(m.alignments) for m in made), sum(len(m.aligned) for m in made))
     if found.error or not depths:
         reasons = [a.reason for m in made for a in m.alignments if not a.ok]

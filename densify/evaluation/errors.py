@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from densify.dense_map import DenseMapFiles, Surface
 from densify.evaluation.records import DistanceFigures, Gap, SurfaceFigures
+from densify.evaluation.smoothness import NO_EDGES, Edges, edges
 from densify.similarity import Similarity
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
@@ -91,6 +92,8 @@ class TrueSurface:
     sampling: str
     mesh: Surface | None = None
     mesh_source: str = ""
+    edges: Edges = NO_EDGES
+    """of the mesh, or of the one that was there"""
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -161,6 +164,8 @@ class SurfaceErrors:
     accuracy: np.ndarray
     to_mesh: np.ndarray | None
     completeness: np.ndarray
+    edges: Edges = NO_EDGES
+    """of the model's mesh, where it has one"""
 
     def summary(self, thresholds_mm: Sequence[float]) -> SurfaceFigures:
         """Figures for the report. Precision, recall: shares of model and true points within each threshold."""
@@ -180,6 +185,7 @@ class SurfaceErrors:
             recall=recall,
             f_score={key: _harmonic_mean(precision[key], recall[key]) for key in precision},
             chamfer_mm=float(self.accuracy.mean() + self.completeness.mean()) / 2,
+            sharp_edges=self.edges.share,
         )
 
 
@@ -187,12 +193,14 @@ def _harmonic_mean(p: float, r: float) -> float:
     return 2 * p * r / (p + r) if p + r else 0.0
 
 
-def surface_errors(model: np.ndarray, truth: TrueSurface) -> SurfaceErrors:
-    """Of model points (n, 3) [mm]. Raises InputError when there are none."""
+def surface_errors(model: np.ndarray, truth: TrueSurface, triangles: np.ndarray | None = None) -> SurfaceErrors:
+    """Of model points (n, 3) [mm], with triangles (m, 3) over them where it is a mesh. Raises InputError when there are
+    no points."""
     return SurfaceErrors(
         accuracy=closest(model, truth.tree),
         to_mesh=None if truth.mesh is None else truth.mesh.distance(model),
         completeness=closest(truth.cloud, cKDTree(model)),
+        edges=NO_EDGES if triangles is None else edges(model, triangles),
     )
 
 
@@ -203,6 +211,7 @@ def pooled(errors: Sequence[SurfaceErrors]) -> SurfaceErrors:
         np.concatenate([e.accuracy for e in errors]),
         np.concatenate(meshes) if meshes else None,
         np.min([e.completeness for e in errors], 0),
+        Edges(sum(e.edges.sharp for e in errors), sum(e.edges.all for e in errors)),
     )
 
 

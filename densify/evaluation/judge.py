@@ -84,7 +84,7 @@ def judge_maps(
                 clouds[name] = None
                 continue
             points = found.true_from_map.apply(cloud)
-            distances = surface_errors(points, truth.surface)
+            distances = surface_errors(points, truth.surface, m.triangles if name == "dense" else None)
             errors[name].append(distances)
             clouds[name] = distances.summary(thresholds_mm)
             if name == "dense" and m.triangles is not None:
@@ -117,7 +117,7 @@ def _described(truth: Truth) -> TruthFigures:
         return TruthFigures(*counts, truth.no_surface, None, None, None)
     spacing = surface.spacing_mm if np.isfinite(surface.spacing_mm) else None  # a single point has no neighbour
     mesh = None if surface.mesh is None else surface.mesh_source
-    return TruthFigures(*counts, surface.sampling, len(surface.cloud), spacing, mesh)
+    return TruthFigures(*counts, surface.sampling, len(surface.cloud), spacing, mesh, surface.edges.share)
 
 
 def _ms_per_keyframe(truth: Truth, keyframes: int) -> float | None:

@@ -69,6 +69,8 @@ class SurfaceFigures:
     """harmonic mean of precision and recall, by the distance"""
     chamfer_mm: float
     """mean of the mean distances both ways: from the model's points to the truth, and back"""
+    sharp_edges: float | None = None
+    """share of the mesh's edges at which it turns by more than 30 degrees; None where it has no triangles"""
 
 
 @dataclass(frozen=True)
@@ -201,6 +203,8 @@ class TruthFigures:
     """median distance between neighbouring points"""
     mesh: str | None
     """where the true mesh is from"""
+    sharp_edges: float | None = None
+    """share of the true mesh's edges at which it turns by more than 30 degrees"""
 
 
 @dataclass(frozen=True)

@@ -163,6 +163,7 @@ def completeness_table(results: Mapping[str, MapsJudged], suite: Suite | None = 
     for title, share in _SHARES.items():
         for t in thresholds:
             figures[f"{title} {t}"] = partial(_at, share, t)
+    figures["Edges over 30 deg"] = lambda f: f.sharp_edges
     title = "Table 3. Maps. Distances in mm; precision, recall: shares of model and true points within the threshold."
     return Table(title, _headers(suite.surface_groups, "Method", "Metrics"), _model_rows(results, suite, figures))
 
@@ -325,6 +326,8 @@ def _notes(results: Mapping[str, DepthJudged | MapsJudged], gap: MapGap | None) 
         else:
             truth = judged.truth
             notes.append(f"{name}: truth {truth.cloud}; true mesh: {truth.mesh or 'none'}.\n")
+            if truth.sharp_edges is not None:
+                notes.append(f"The true mesh turns by more than 30° at {truth.sharp_edges:.2%} of its edges.\n")
             if truth.cloud_spacing_mm is not None:
                 notes.append(f"Neighbouring true points are {number(truth.cloud_spacing_mm)} mm apart (median).\n")
             notes += [f"{name}, map {m.map_id}: {m.error}\n" for m in judged.maps if m.error]

@@ -10,6 +10,7 @@ import numpy as np
 
 from densify.dense_map import Surface
 from densify.evaluation.errors import CUBE_MM, TrueSurface, depth_triangles, true_cloud
+from densify.evaluation.smoothness import edges
 from densify.evaluation.trajectory import span
 from lightdepth.datasets import FrameSequence
 from lightdepth.datasets.c3vd_surface import COVERAGE_MESH
@@ -101,6 +102,7 @@ def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bo
         triangles = np.concatenate([t + n for (_, t), n in zip(parts, counts, strict=False)])
         source = f"true depth of {len(parts)} frames triangulated, {len(triangles)} triangles"
     surface = Surface(vertices, triangles) if len(triangles) else None
+    turns = edges(vertices, triangles)
     if mesh is not None and surface is not None:
         off = float(np.median(surface.distance(cloud[:: max(1, len(cloud) // 5000)])))
         if off > 2:
@@ -109,7 +111,7 @@ def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bo
                 f"the true depth is {off:.3g} mm from it (median)",
                 "expected the surface that the sequence shows, in mm, in the frame of reference of its poses",
             )
-    return Truth(*common, TrueSurface(cloud, sampling, surface, source))
+    return Truth(*common, TrueSurface(cloud, sampling, surface, source, turns))
 
 
 def shared_frames(ours: Collection[int], theirs: Sequence[int], what: str, source: str, common: bool) -> list[int]:

@@ -55,6 +55,11 @@ class RectifyConfig:
     """Uncertainty that the model states for a pixel, as standard deviation of log distance (0.15 is 15 %), at which the
     pixel's weight is halved. A larger one trusts uncertain pixels more; models that state none are not affected."""
 
+    feather: Annotated[float, SHARE] = 0.15
+    """Distance from the border of what the image shows, as a share of its smaller side, over which a pixel's weight
+    rises from 0 to full, so that surfaces have no step where an image ends. A larger one makes softer seams and trusts
+    less of the border; 0 makes none."""
+
     def __post_init__(self) -> None:
         if self.field not in ("whole", "pinhole"):
             raise InputError("field", f"{self.field!r} is not known", "expected whole or pinhole")
@@ -106,9 +111,14 @@ class _Lens:
 
 
 def surface_view(
-    prediction: DepthPrediction, image: np.ndarray, config: RectifyConfig, max_distance: float = np.inf
+    prediction: DepthPrediction,
+    image: np.ndarray,
+    config: RectifyConfig,
+    max_distance: float = np.inf,
+    share: np.ndarray | None = None,
 ) -> SurfaceView:
-    """What a (scaled) prediction and its image (H, W, 3) say of the surface; beyond max_distance nothing is known."""
+    """What a (scaled) prediction and its image (H, W, 3) say of the surface; beyond max_distance nothing is known. Each
+    pixel keeps a `share` (H, W) in [0, 1] of its weight, all of it if left out."""
     camera = prediction.camera
     merged = max(1, int(np.ceil(camera.focal_length / config.focal_px - 0.01)))
     lens = _lens(camera, merged)
@@ -118,6 +128,10 @@ def surface_view(
     distance = np.where(valid, prediction.distance, 1).astype(np.float32, copy=False)
     light = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2]).astype(np.float32)
     color, sigma = image, prediction.uncertainty
+    kept = feathered(valid, config.feather)
+    if share is not None:
+        kept = kept * share
+    valid &= kept > 0
     points = distance * lens.rays if merged == 1 else None
     edge = np.zeros(valid.shape, bool)
     if merged > 1:
@@ -128,11 +142,12 @@ def surface_view(
             > (config.max_slope * merged / camera.focal_length / 2) ** 2
         )
         light, sigma = _merge(light, valid, merged), None if sigma is None else _merge(sigma, valid, merged)
+        kept = _merge(kept, valid, merged)
         color = np.stack([_merge(image[..., c], valid, merged) for c in range(3)], -1)
         valid = _merge(valid, np.ones_like(valid), merged) > 0
         distance = np.where(valid, np.sqrt((points**2).sum(0)), np.float32(1))
     assert points is not None
-    trust = light_weight(light, config)
+    trust = light_weight(light, config) * kept
     if sigma is not None:
         trust /= 1 + (sigma / np.float32(config.sigma)) ** 2
     near, trust = valid & (distance <= max_distance), trust.astype(np.float32, copy=False)
@@ -148,6 +163,17 @@ def surface_view(
     colors[:, 3] = 1
     points = np.concatenate([points.reshape(3, -1), np.zeros((3, 1), np.float32)], 1)
     return SurfaceView(points, planes, weights, colors, lens.table)
+
+
+def feathered(valid: np.ndarray, feather: float) -> np.ndarray:
+    """Share (H, W) float32 of its weight that a pixel keeps beside the border of what is valid (H, W), which the border
+    of the image is too: it rises steadily over `feather` of the smaller side. 0 where invalid."""
+    if not feather:
+        return valid.astype(np.float32)
+    framed = np.pad(valid.astype(np.uint8), 1)
+    reach = cv2.distanceTransform(framed, cv2.DIST_L2, 3)[1:-1, 1:-1]
+    result: np.ndarray = np.minimum(reach / np.float32(feather * min(valid.shape)), 1)
+    return result
 
 
 def light_weight(value: np.ndarray, config: RectifyConfig) -> np.ndarray:

@@ -1,8 +1,8 @@
 """TsdfVolume: views of any lens in, one surface out.
 
 Notation: s signed distance of a voxel from the surface as one view has it, positive on the side of the camera, cut off
-at tau; w that view's weight there, falling to 0 at tau behind the surface (Bylow et al., RSS 2013). A voxel holds
-the sums of w and of w s / tau over views.
+at tau; w that view's weight there, falling to 0 at tau behind the surface (Bylow et al., RSS 2013) and to `front`
+of it at tau before, so that where a view ends nothing jumps. A voxel holds the sums of w and of w s / tau over views.
 
 s is taken to the plane of the pixel that the voxel's direction falls into: exact on planes, whatever the slant, and no
 image has to be resampled into pinhole views. Sums are of whole numbers. So a view can be taken out again, the order of
@@ -21,7 +21,7 @@ from densify.fusion.marching_cubes import BLOCK, CORNERS, REACH, Cut, cut, one_v
 from densify.fusion.rectify import FULL, SurfaceView
 from densify.fusion.second_core import halves
 from lightdepth.errors import InputError
-from lightdepth.ranges import COUNT, above, checked
+from lightdepth.ranges import COUNT, SHARE, above, checked
 from lightdepth.sparse_map import Submap, typical_distance
 
 STEPS = 2048
@@ -47,6 +47,10 @@ class FusionConfig:
     min_views: Annotated[int, COUNT] = 1
     """Least number of keyframes that must have seen a piece of surface for it to be kept; the recipe paper keeps all.
     More leave out what few have seen."""
+    front: Annotated[float, SHARE] = 0.3
+    """Weight, from 0 to 1, that a keyframe keeps where the wall is, by its depth, farther on by the truncation or more;
+    it falls steadily from the wall to there. A larger one cuts away more of what keyframes look through, with steps
+    where they disagree; 1 cuts with full weight."""
     far: Annotated[float, above(0)] = 2.0
     """Farthest distance from a keyframe that is fused, as a multiple of the distance within which 90 % of its inliers
     lie. A larger one reaches farther, where depth is worse."""
@@ -122,7 +126,8 @@ class TsdfVolume:
             lambda first, end: _add_view(
                 self._weight, self._distance, self._seen, self._color, self._behind, self._known, slots,
                 origins, offsets, pixels, view.planes, view.weights, view.colors,
-                np.float32(self._config.truncation * self.voxel), np.float32(_COLORED * self.voxel), sign,
+                np.float32(self._config.truncation * self.voxel), np.float32(self._config.front),
+                np.float32(_COLORED * self.voxel), sign,
                 self._config.min_views, first, end, any_left,
             ),
             len(slots),
@@ -263,6 +268,7 @@ def _add_view(
     weights: np.ndarray,
     colors: np.ndarray,
     tau: float,
+    front: np.float32,
     colored: np.float32,
     sign: int | np.int32,
     least: int,
@@ -275,7 +281,7 @@ def _add_view(
     then goes into any_left (n,)."""
     # Loops of one kind each, and choices instead of min and max: so those over sums are done eight at a time.
     zero, one, sign = np.float32(0), np.float32(1), np.int32(sign)
-    steps, per_tau = np.float32(STEPS) / tau, one / tau
+    steps, per_tau, fall = np.float32(STEPS) / tau, one / tau, (front - one) / tau
     plane = np.empty((4, 512), np.float32)
     full, s = np.empty(512, np.float32), np.empty(512, np.float32)
     signed = np.empty(512, np.int32)
@@ -293,8 +299,9 @@ def _add_view(
             s[v] = d
             trust = one + d * per_tau  # what lies behind a wall is ever less known
             trust = trust if trust > zero else zero
-            trust = trust if trust < one else one
             d = d if d < tau else tau
+            open_ = one + d * fall  # what is looked through, the farther from the wall
+            trust = trust if trust < open_ else open_
             d = d if d > -tau else -tau
             w = np.int32(np.rint(full[v] * trust)) * sign
             signed[v] = w
