@@ -12,6 +12,7 @@ from densify.contradiction import ContradictionConfig
 from densify.coverage import CoverageConfig
 from densify.fusion.rectify import RectifyConfig
 from densify.fusion.volume import FusionConfig
+from densify.gating import GateConfig
 from densify.judging.ahead import AheadConfig
 from densify.judging.config import JudgeConfig
 from lightdepth.errors import InputError
@@ -86,6 +87,8 @@ class DensifyConfig(OfflineConfig):
     """when wall counts as seen well"""
     judge: JudgeConfig = field(default_factory=JudgeConfig)
     """how the result is judged, and bends that make it worse are undone (--judge.on false leaves that out)"""
+    gate: GateConfig = field(default_factory=GateConfig)
+    """which keyframes are doubted as light says little of their depth (--gate.on leaves them out)"""
     recipe: Recipe = "full"
     """How dense maps are made: full, with all steps below, or paper, as published: one LMedS scale per keyframe, one
     undistorted pinhole image, a plain TSDF. To what is published, paper adds the gates of alignment, which leave out

@@ -14,6 +14,7 @@ error as they were.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -57,8 +58,8 @@ class Lit:
     def of(cls, frame: Frame) -> Lit:
         """Of the frame's valid pixels, at 128 rows."""
         height, width = frame.valid.shape
-        value = np.ascontiguousarray(frame.image.max(-1), dtype=np.float32)
-        inside = frame.valid.astype(np.float32)
+        value: np.ndarray = np.ascontiguousarray(frame.image.max(-1), dtype=np.float32)
+        inside: np.ndarray = frame.valid.astype(np.float32)
         if height > _ROWS:
             size = max(1, round(width * _ROWS / height)), _ROWS
             weight = cv2.resize(inside, size, interpolation=cv2.INTER_AREA)
@@ -83,8 +84,10 @@ class Lit:
         return f"its bright light is only {self.contrast:.2f} times its dark light ({cause})"
 
 
-def said(doubts: int, frames: int, first: str, reason: str) -> str:
-    """A sentence on the frames of a run whose depth is doubted."""
+def sentence(doubts: Mapping[str, str], frames: int) -> str:
+    """A sentence on the frames of a run whose depth is doubted: reasons by name, at least one."""
+    name, reason = next(iter(doubts.items()))
     return (
-        f"the depth of {doubts} of {frames} frames is doubted, there is too little contrast of light: {first}: {reason}"
+        f"the depth of {len(doubts)} of {frames} frames is doubted, as they have too little contrast of light; the "
+        f"first, {name}: {reason}"
     )
