@@ -101,7 +101,7 @@ class Densified:
             return ""
         alignments = [a for result in self.results for a in result.dense.alignments]
         out = sum(a.reason.startswith(LEFT_OUT) for a in alignments)
-        return f"{sentence(doubts, len(alignments))} ({out} left out of the surface for that: --gate.on)"
+        return f"{sentence(doubts, len(alignments))} ({out} left out of the surface for that)"
 
     def proposals(self) -> dict[int, str]:
         """What could make a map better, by its id, where the images speak against it."""

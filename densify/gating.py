@@ -18,7 +18,7 @@ LEFT_OUT = "its depth is doubted"
 class GateConfig:
     """Which keyframes are doubted for depth, and what becomes of them."""
 
-    on: bool = False
+    on: bool = True
     """Whether keyframes whose depth is doubted are left out of the surface, unless these are more than half of a
     submap's; switched off, they are fused like others, and only named. The recipe paper leaves none out."""
     contrast: Annotated[float, at_least(1, up_to=1000)] = DepthGate.contrast
