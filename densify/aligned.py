@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,9 +12,12 @@ from densify.alignment import Alignment, AlignmentConfig, align, bent
 from densify.bending import Bend
 from densify.config import MethodConfig
 from densify.contradiction import ContradictionConfig, uncontradicted
+from densify.gating import LEFT_OUT, GateConfig
 from densify.predictions import SeenKeyframe
 from lightdepth.observations import ObservedDistances, observed_distances, unobserved
 from lightdepth.sparse_map import Keyframe, Submap
+
+_MOST_DOUBTED = 0.5  # share of a submap's keyframes that may be left out; where more are doubted, the wall is as it is
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,22 @@ def uncontradicted_keyframes(
     rows, views, bends = zip(*used, strict=True) if used else ((), (), ())
     stays = dict(zip(rows, uncontradicted(views, bends, shared[np.ix_(rows, rows)], config), strict=True))
     return [replace(k, stays=stays.get(i)) for i, k in enumerate(keyframes)]
+
+
+def undoubted(
+    keyframes: Sequence[AlignedKeyframe], doubts: Mapping[str, str], config: GateConfig
+) -> list[AlignedKeyframe]:
+    """The same keyframes; where the gate is on, those that are doubted have the doubt (by name) as their reason to be
+    left out, unless they are more than half."""
+    if not config.on or len(doubts) > _MOST_DOUBTED * len(keyframes):
+        return list(keyframes)
+    return [_left_out(k, doubts.get(k.keyframe.name, "")) for k in keyframes]
+
+
+def _left_out(aligned: AlignedKeyframe, doubt: str) -> AlignedKeyframe:
+    if not doubt or not aligned.alignment.ok:
+        return aligned
+    return replace(aligned, alignment=replace(aligned.alignment, reason=f"{LEFT_OUT}: {doubt}"))
 
 
 def unread(keyframes: Sequence[AlignedKeyframe]) -> dict[str, str]:

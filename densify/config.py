@@ -12,6 +12,7 @@ from densify.contradiction import ContradictionConfig
 from densify.coverage import CoverageConfig
 from densify.fusion.rectify import RectifyConfig
 from densify.fusion.volume import FusionConfig
+from densify.gating import GateConfig
 from densify.judging.ahead import AheadConfig
 from densify.judging.config import JudgeConfig
 from lightdepth.errors import InputError
@@ -86,12 +87,14 @@ class DensifyConfig(OfflineConfig):
     """when wall counts as seen well"""
     judge: JudgeConfig = field(default_factory=JudgeConfig)
     """how the result is judged, and bends that make it worse are undone (--judge.on false leaves that out)"""
+    gate: GateConfig = field(default_factory=GateConfig)
+    """which keyframes are doubted as light says little of their depth (--gate.on true leaves them out)"""
     recipe: Recipe = "full"
     """How dense maps are made: full, with all steps below, or paper, as published: one LMedS scale per keyframe, one
     undistorted pinhole image, a plain TSDF. To what is published, paper adds the gates of alignment, which leave out
     keyframes whose scale is unsure, and fusion.far, beyond which nothing is fused; report and run.json list them, with
     the values that open them. It refuses settings of agreement, bending, contradiction and rectify, which it has not,
-    and ignores coverage and fusion.min_views."""
+    and ignores coverage, gate.on and fusion.min_views."""
     keep_mb: Annotated[float, at_least(0)] = 1000.0
     """Memory, megabytes, for the images and predictions of a submap that are kept from one pass over it to the next;
     what does not fit is read and predicted again. More save time and change nothing else."""

@@ -10,6 +10,7 @@ from functools import cached_property, partial
 from densify.additions import additions, said
 from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
+from densify.gating import LEFT_OUT
 from densify.joining import MergeConfig, Merged, joined_name, merge
 from densify.judging.doubts import DoubtsCalibrated, calibrated_together
 from densify.judging.verdict import Verdict, doubted, proposal, worst
@@ -18,6 +19,7 @@ from densify.pipeline import SubmapResult, densify_or_empty
 from densify.predictions import SeenKeyframe
 from densify.resuming import kept_result
 from lightdepth.datasets import FrameSequence
+from lightdepth.depth_gate import sentence
 from lightdepth.errors import InputError
 from lightdepth.hidden_uncertainty import FILE
 from lightdepth.models import DepthModel
@@ -91,6 +93,16 @@ class Densified:
             return "not calibrated: nothing was judged"
         return str(self.uncertainty or f"not calibrated: {self.model} predicts none")
 
+    @property
+    def doubted(self) -> str:
+        """Whose depth the gate doubts, and what became of it, in a sentence; empty where nobody's."""
+        doubts = {name: why for result in self.results for name, why in result.doubts.items()}
+        if not doubts:
+            return ""
+        alignments = [a for result in self.results for a in result.dense.alignments]
+        out = sum(a.reason.startswith(LEFT_OUT) for a in alignments)
+        return f"{sentence(doubts, len(alignments))} ({out} left out of the surface for that)"
+
     def proposals(self) -> dict[int, str]:
         """What could make a map better, by its id, where the images speak against it."""
         told = {r.dense.submap.id: proposal(r.judgement) for r in self.results if r.judgement is not None}
@@ -104,6 +116,7 @@ class Densified:
         notes += [f"{of}; depth by {self.model}; light of the frames: {under}."]
         notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
         notes.append(f"Uncertainty: {self.of_uncertainty}.")
+        notes += [f"Light: {self.doubted}."] if self.doubted else []
         if self.config.recipe == "paper":
             notes.append(f"{said(additions(self.config))}.")
         submaps = [result.dense.submap for result in self.results]
@@ -147,6 +160,7 @@ class Densified:
                     "coverage": result.coverage and result.coverage.scaled(mm_per_unit or 1.0).record(),
                     "verdict": judgement and plain(judgement.verdict),
                     "judge": judgement and judgement.record(),
+                    "doubted": result.doubts,
                     "seconds": result.seconds,
                 }
             )
@@ -167,6 +181,8 @@ class Densified:
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
         if self.merged is not None:
             self._write_joined(run, self.merged, formats, mm_per_unit)
+        if self.doubted:
+            run.log(self.doubted)
         self._say_if_few(run)
         run.record.update(
             {"unit": "mm" if mm_per_unit else "map units", "checkpoint": self.model, "maps": plain(records)}

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from densify.aligned import AlignedKeyframe, align_alone, align_together, uncontradicted_keyframes, unread
+from densify.aligned import (
+    AlignedKeyframe,
+    align_alone,
+    align_together,
+    uncontradicted_keyframes,
+    undoubted,
+    unread,
+)
 from densify.config import DensifyConfig
 from densify.coverage import Coverage, coverage, seen_share
 from densify.dense_map import DenseMap
@@ -35,6 +42,8 @@ class SubmapResult(Brief):
     """keyframes whose image is missing or unreadable, with the reason"""
     coverage: Coverage | None = None
     """what of the wall was seen; None under the paper's recipe, whose fusion cannot tell"""
+    doubts: dict[str, str] = field(default_factory=dict)
+    """keyframes whose depth is doubted for want of light's contrast, with the reason; left out or not"""
 
 
 OnKeyframe = Callable[[Submap, AlignedKeyframe, SeenKeyframe], None]
@@ -79,21 +88,25 @@ def densify_submap(
 ) -> SubmapResult:
     """The dense map of one submap, in the order of the paper's method section.
 
-    Each keyframe's distance is predicted and aligned by itself, to the map points that it observed; then all are
-    aligned together, bends that make things worse are undone, and what nearer keyframes contradict is left out. What
-    remains is fused into one surface, and judged. Raises InputError where no keyframe observes a point.
+    Each keyframe's distance is predicted and aligned by itself, to the map points that it observed; those that the gate
+    for depth doubts may be left out; then all are aligned together, bends that make things worse are undone, and what
+    nearer keyframes contradict is left out. What remains is fused into one surface, and judged. Raises InputError where
+    no keyframe observes a point.
     """
     clock, fuser = Clock(), fuser_for(submap, config)
     judge, shared = Judge(submap, config), covisibility(submap)
     predictions = Predictions(frames, model, config.keep_mb, clock)
-    keyframes = []
+    keyframes, doubts = [], {}
     for keyframe in submap.keyframes:
         seen = predictions.of(keyframe)
+        if doubt := config.gate.doubt(seen.frame):
+            doubts[keyframe.name] = doubt
         with clock("align"):
             keyframes.append(align_alone(keyframe, submap, seen, config.alignment))
         with clock("judge"):
             judge.see(keyframes[-1], seen)
     if config.recipe == "full":
+        keyframes = undoubted(keyframes, doubts, config.gate)
         with clock("agree"):
             keyframes = align_together(keyframes, shared, config)
         with clock("judge"):
@@ -114,4 +127,4 @@ def densify_submap(
         covered = None if dense.weights is None else coverage(dense, config.coverage)
     with clock("judge"):
         judgement, share = judge.judgement(dense, keyframes), seen_share(dense, frames)
-    return SubmapResult(dense, judgement, share, dict(clock), unread(keyframes), covered)
+    return SubmapResult(dense, judgement, share, dict(clock), unread(keyframes), covered, doubts)

@@ -120,7 +120,18 @@ def test_spoilt_frames_are_the_same_twice_and_their_table_has_each_corruption(ru
     found = json.loads((run / "per-frame.json").read_text(encoding="utf-8"))["spoilt"]
     first = [SpoiltFrame(**row) for row in found if (row["colon"], row["model"]) == (colon.name, "decline")]
     assert spoilt_frames(colon, frames, model) == first
-    assert [row[0] for row in spoilt_tables(first)[0].rows] == list(CORRUPTIONS)
+    matching, depth = spoilt_tables(first)
+    assert [row[0] for row in matching.rows] == [row[0] for row in depth.rows] == list(CORRUPTIONS)
+    assert "matching" in matching.title and "depth" in depth.title
+
+
+def test_the_tables_of_spoilt_frames_count_what_each_gate_keeps_and_how_often_it_was_right():
+    rows = [
+        SpoiltFrame("c", "mine", "smoke", 1, kept=False, doubted=i == 0, clean=0.1, error=0.3 if i == 0 else 0.14)
+        for i in range(4)
+    ] + [SpoiltFrame("c", "mine", c, s, True, False, 0.1, 0.1) for c in CORRUPTIONS for s in (1, 2, 3, 4, 5)]
+    matching, depth = (table.rows[CORRUPTIONS.index("smoke")][1] for table in spoilt_tables(rows))
+    assert matching == "1.00, 20%, 25%" and depth == "1.30, 80%, 100%"
 
 
 def test_every_model_gets_a_row_for_a_colon():

@@ -1,12 +1,13 @@
-"""Depth of spoilt frames (lightdepth.judge_colons.corruption), and which of them `import` would keep.
+"""Depth of spoilt frames (lightdepth.judge_colons.corruption), and which of them two gates keep.
 
-Every third frame of a colon is spoilt alone, among its neighbours as they were: the gate of lightdepth.importing sees
-it as it would a bad frame of a clip. The error is AbsRel after the median scale; its ratio is to the same frames clean.
+Every third frame of a colon is spoilt alone, among its neighbours as they were: the gate of lightdepth.importing, made
+for matching, sees it as it would a bad frame of a clip. That of lightdepth.depth_gate, for depth from light, sees it
+alone. The error is AbsRel after the median scale; its ratio is to the same frames clean.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from densify.bench.per_frame import MAX_DEPTH_MM
 from densify.evaluation.errors import compare_depth
 from densify.evaluation.tables import Table
+from lightdepth.depth_gate import DepthGate
 from lightdepth.errors import InputError
 from lightdepth.files.images import to_bgr8
 from lightdepth.frame import Frame
@@ -34,14 +36,15 @@ NOTHING = 10.0
 
 @dataclass(frozen=True)
 class SpoiltFrame:
-    """One spoilt frame: whether it is kept, and its AbsRel as it was (`clean`) and spoilt (NOTHING where nothing of
-    it can be judged)."""
+    """One spoilt frame: whether `import` keeps it, whether its depth is doubted, and its AbsRel as it was (`clean`) and
+    spoilt (NOTHING where nothing of it can be judged)."""
 
     colon: str
     model: str
     corruption: str
     severity: int
     kept: bool
+    doubted: bool
     clean: float
     error: float
 
@@ -57,12 +60,10 @@ def spoilt_frames(colon: JudgeColon, frames: Sequence[Frame], models: Sequence[D
             for severity in SEVERITIES:
                 rng = np.random.default_rng([VERSION, colon.seed, every[i].number, kind, severity])
                 bad = corrupted(every[i], corruption, severity, rng)
-                kept = gate.keeps(i, bad)
+                kept, doubted = gate.keeps(i, bad), bool(DepthGate().doubt(bad))
                 for model in models:
-                    error = _error(model, bad)
-                    found.append(
-                        SpoiltFrame(colon.name, model.name, corruption, severity, kept, clean[model.name], error)
-                    )
+                    errors = clean[model.name], _error(model, bad)
+                    found.append(SpoiltFrame(colon.name, model.name, corruption, severity, kept, doubted, *errors))
     return found
 
 
@@ -99,26 +100,32 @@ def _measured(frames: Sequence[Frame]) -> Measures:
 
 
 def spoilt_tables(rows: Sequence[SpoiltFrame]) -> list[Table]:
-    """By model, corruptions by severity: ratio on the frames kept, share kept, share of the refused that err more."""
+    """By model and gate, corruptions by severity: ratio on the frames kept, share kept, share of the refused that err
+    more."""
     found = []
     for model in dict.fromkeys(row.model for row in rows):
-        lines: list[list[object]] = []
-        for corruption in CORRUPTIONS:
-            cells = [
-                _cell([r for r in rows if (r.model, r.corruption, r.severity) == (model, corruption, severity)])
-                for severity in SEVERITIES
-            ]
-            lines.append([corruption, *cells])
-        title = (
-            f"{model}: error on the frames kept over the same frames' clean, share kept, share of the refused whose "
-            f"error is more than {WORSE:g} times their clean one"
-        )
-        found.append(Table(title, ["corruption", *(f"severity {s}" for s in SEVERITIES)], lines))
+        for gate, kept in _GATES.items():
+            lines: list[list[object]] = []
+            for corruption in CORRUPTIONS:
+                of = [row for row in rows if (row.model, row.corruption) == (model, corruption)]
+                cells = [_cell([row for row in of if row.severity == severity], kept) for severity in SEVERITIES]
+                lines.append([corruption, *cells])
+            title = (
+                f"{model}, {gate}: error on the frames kept over the same frames' clean, share kept, share of the "
+                f"refused whose error is more than {WORSE:g} times their clean one"
+            )
+            found.append(Table(title, ["corruption", *(f"severity {s}" for s in SEVERITIES)], lines))
     return found
 
 
-def _cell(rows: Sequence[SpoiltFrame]) -> str:
-    kept, refused = ([row for row in rows if row.kept is kept] for kept in (True, False))
+_GATES: dict[str, Callable[[SpoiltFrame], bool]] = {
+    "import's gate (for matching)": lambda row: row.kept,
+    "the gate for depth": lambda row: not row.doubted,
+}
+
+
+def _cell(rows: Sequence[SpoiltFrame], keeps: Callable[[SpoiltFrame], bool]) -> str:
+    kept, refused = ([row for row in rows if keeps(row) is wanted] for wanted in (True, False))
     ratio = f"{np.mean([r.error for r in kept]) / np.mean([r.clean for r in kept]):.2f}" if kept else "–"
     worse = f"{np.mean([r.error > WORSE * r.clean for r in refused]):.0%}" if refused else "–"
     return f"{ratio}, {len(kept) / len(rows):.0%}, {worse}"

@@ -241,7 +241,7 @@ def compare_per_frame(
         colons: Folder colons/ of an earlier run, whose frames are taken in place of making them anew, which takes some
             ten minutes.
         spoilt: Judge frames with blur, smoke, water drops, clipping, noise and compression too, at five severities:
-            error, and the share that import would keep; some minutes more for each model.
+            error, and the shares that import and the gate for depth would keep; some minutes more for each model.
         overwrite: Replace a run made before.
         resume: Go on with the run that was stopped there, as it was begun; colons that were judged are not made again.
     """

@@ -21,6 +21,7 @@ from densify.judging.withheld import Withheld
 from densify.live.densifier import STEPS, Densifier, StepTime
 from densify.predictions import Predictor
 from lightdepth.datasets import FrameSequence
+from lightdepth.depth_gate import DepthGate
 from lightdepth.errors import InputError
 from lightdepth.reporting.figures import chart, chart_png
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
@@ -32,8 +33,9 @@ _COLORS = ("#b8b8b8", "#2a6f97", "#8a6fb0", "#e09f3e", "#9e2a2b", "#5a8f5a")
 @dataclass(frozen=True, eq=False)
 class Played:
     """One keyframe. `times` by step; `arrival` and `done` in seconds since the first; `renewed` blocks were looked at
-    again, `patches` hold the surface. `reason` says why it took no part, `unread` that its image was not there; `ahead`
-    are errors (n, 5) of the depth before it at its new points (densify.judging.ahead)."""
+    again, `patches` hold the surface. `reason` says why it took no part, `unread` that its image was not there; `doubt`
+    why its depth is doubted (lightdepth.depth_gate), which changes nothing of the surface; `ahead` are errors (n, 5)
+    of the depth before it at its new points (densify.judging.ahead)."""
 
     map: int
     keyframe: str
@@ -45,6 +47,7 @@ class Played:
     kept_bytes: int
     reason: str = ""
     unread: bool = False
+    doubt: str = ""
     ahead: np.ndarray = field(default_factory=lambda: NOTHING)
 
     @property
@@ -126,17 +129,19 @@ def _play_one(
         except InputError as error:
             reason = str(error)
     mesh = densifier.mesh()
+    done = time.perf_counter() - start
     return Played(
         map=submap.id,
         keyframe=keyframe.name,
         times=dict(densifier.times),
         arrival=arrival,
-        done=time.perf_counter() - start,
+        done=done,
         renewed=len(mesh.renewed),
         patches=len(mesh.patches),
         kept_bytes=densifier.kept_bytes,
         reason=reason,
         unread=frame is None,
+        doubt="" if frame is None else DepthGate().doubt(frame),
         ahead=np.concatenate([NOTHING, *densifier.ahead[asked:]]),
     )
 

@@ -12,6 +12,7 @@ from densify.judging.verdict import doubted, worst
 from densify.judging.withheld import Withheld
 from densify.live.page import live_page
 from densify.live.play import Finished, Played, time_spent, timings_picture, write_timings
+from lightdepth.depth_gate import sentence
 from lightdepth.errors import InputError
 from lightdepth.reporting.run import Run, plain
 
@@ -104,6 +105,9 @@ class PlayedRun:
         ]
         run.record.update(plain({"unit": unit, "checkpoint": model, "verdict": verdict, "maps": maps}))
         run.record["timings"] = plain(spent.record())
+        run.record["doubted"] = doubts = {p.keyframe: p.doubt for p in played if p.doubt}
+        if doubts:
+            run.log(sentence(doubts, len(played)))
         live_page(verdict, judged, played, picture).write(run.folder / "report.html")
         timings = spent.timings
         assert timings is not None, "a surface has keyframes that were read"

@@ -12,6 +12,7 @@ from lightdepth.checkpoint import ModelSource
 from lightdepth.colour import ColourMeter
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
+from lightdepth.depth_gate import DepthGate, sentence
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.hidden_uncertainty import read_factor
@@ -67,15 +68,17 @@ def predict(
         frames = open_frames(source, run).without_truth()
         if previews:
             (run.folder / "previews").mkdir(exist_ok=True)
-        nothing, meter = 0, ColourMeter()
+        nothing, meter, gate = 0, ColourMeter(), DepthGate()
+        doubts: dict[str, str] = {}
         with Progress("Predicting", len(frames)) as bar:
             for batch in batches(run, "frames", len(frames)):
                 if batch.finished:
                     meter.go_on(batch.kept["colours"], batch.arrays())
                     nothing += batch.kept["nothing"]
+                    doubts |= batch.kept["doubts"]
                     bar.advance(len(batch))
                     continue
-                taken, black = meter.taken(), 0
+                taken, black, doubted = meter.taken(), 0, {}
                 for i in batch:
                     bar.advance()
                     try:
@@ -87,11 +90,14 @@ def predict(
                     meter.add(frame.image, frame.valid)
                     prediction = model(frame)
                     black += not prediction.valid.any()
+                    if doubt := gate.doubt(frame):
+                        doubted[frame.name] = doubt
                     if factor is not None and prediction.uncertainty is not None:
                         prediction = replace(prediction, uncertainty=prediction.uncertainty * np.float32(factor))
                     batch.files += _written(run.folder, frame, prediction, previews)
-                batch.finish({"nothing": black, "colours": meter.since(taken)}, meter.last())
+                batch.finish({"nothing": black, "doubts": doubted, "colours": meter.since(taken)}, meter.last())
                 nothing += black
+                doubts |= doubted
         if len(run.record["failures"]) == len(frames):
             raise InputError(source.data, "no frame could be read", f"the first: {run.record['failures'][0]['reason']}")
         if nothing:
@@ -99,6 +105,9 @@ def predict(
         colours = meter.result()
         for doubt in colours.doubts:
             run.warn(doubt)
+        if doubts:
+            run.warn(sentence(doubts, len(frames)))
+        run.record["doubted"] = doubts
         run.record["colour"] = colours.record()
         run.record["checkpoint"] = model.name
         run.record["uncertainty_factor"] = factor
