@@ -103,6 +103,9 @@ class DenseMap(Brief):
     views: np.ndarray | None = None
     contributions: Mapping[str, Contribution] = field(default_factory=dict)
     expected_error: np.ndarray | None = None
+    unsure_share: float | None = None
+    """share of the valid pixels of the aligned keyframes that were left out because they are expected to err by more
+    than fusion.max_error; None where nothing was left out by that"""
 
     @classmethod
     def of(cls, volume: TsdfVolume, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:

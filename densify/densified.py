@@ -117,6 +117,8 @@ class Densified:
         notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
         notes.append(f"Uncertainty: {self.of_uncertainty}.")
         notes += [f"Light: {self.doubted}."] if self.doubted else []
+        told = [(r.dense.submap.id, r.dense.unsure_share) for r in self.results]
+        notes += [f"Map {i}: {unsure(share, self.config)}." for i, share in told if share is not None]
         if self.config.recipe == "paper":
             notes.append(f"{said(additions(self.config))}.")
         submaps = [result.dense.submap for result in self.results]
@@ -157,6 +159,7 @@ class Densified:
                     "voxel": dense.voxel,
                     "origin": [value * (mm_per_unit or 1.0) for value in dense.submap.origin],
                     "seen_share": result.seen_share,
+                    "unsure_share": dense.unsure_share,
                     "coverage": result.coverage and result.coverage.scaled(mm_per_unit or 1.0).record(),
                     "verdict": judgement and plain(judgement.verdict),
                     "judge": judgement and judgement.record(),
@@ -178,6 +181,8 @@ class Densified:
                     run.log(f"{name}: {judgement.verdict}")
             if result.coverage is not None:
                 text += f"; {result.coverage.well_share:.0%} of the wall seen well, {len(result.coverage.holes)} holes"
+            if dense.unsure_share is not None:
+                text += f"; {unsure(dense.unsure_share, self.config)}"
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
         if self.merged is not None:
             self._write_joined(run, self.merged, formats, mm_per_unit)
@@ -223,6 +228,11 @@ class Densified:
             run.log(f"{text}{len(dense.aligned)} of {len(dense.alignments)} keyframes aligned")
         for map_id, reason in merged.meeting.alone().items():
             run.log(f"map {map_id} joins no other: {reason}")
+
+
+def unsure(share: float, config: DensifyConfig) -> str:
+    """What was left out of a surface because it is expected to be wrong, in words."""
+    return f"{share:.0%} of the pixels are left out, expected to err by more than {config.fusion.max_error:g} %"
 
 
 def note_recipe(run: Run, config: DensifyConfig) -> None:

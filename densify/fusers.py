@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -13,9 +14,10 @@ from densify.config import DensifyConfig, MethodConfig
 from densify.contradiction import share_at
 from densify.coverage import Given, with_contributions
 from densify.dense_map import DenseMap
+from densify.expected import expected_share
 from densify.fusion.plain import PlainTsdf, undistorted
 from densify.fusion.rectify import SurfaceView, surface_view
-from densify.fusion.volume import TsdfVolume
+from densify.fusion.volume import FusionConfig, TsdfVolume
 from densify.judging.images import Seen
 from densify.predictions import SeenKeyframe
 from lightdepth.prediction import DepthPrediction
@@ -45,11 +47,27 @@ def view_to_fuse(
     config: MethodConfig,
     stays: np.ndarray | None = None,
 ) -> SurfaceView:
-    """A keyframe's depth in map units, rectified, as far as the fusion reaches. `stays` (h, w), coarse, is the share of
-    its weight that a pixel keeps; None is all of it."""
-    reach = config.fusion.far * alignment.range_90
-    share = None if stays is None else share_at(stays, prediction.valid.shape)
-    return surface_view(alignment.applied(prediction), image, config.rectify, reach, share)
+    """A keyframe's depth in map units, rectified, as far as the fusion reaches and where it is expected to be right.
+    `stays` (h, w), coarse, is the share of its weight that a pixel keeps; None is all of it."""
+    return _rectified(alignment, sure(alignment, prediction, image, config.fusion), image, config, stays)
+
+
+def sure(alignment: Alignment, prediction: DepthPrediction, image: np.ndarray, config: FusionConfig) -> DepthPrediction:
+    """The prediction in map units, less the pixels that are expected to err by more than the fusion takes."""
+    applied = alignment.applied(prediction)
+    error = expected_share(applied, alignment.range_90, image)
+    return replace(applied, valid=applied.valid & (100 * error <= config.max_error))
+
+
+def _rectified(
+    alignment: Alignment,
+    applied: DepthPrediction,
+    image: np.ndarray,
+    config: MethodConfig,
+    stays: np.ndarray | None,
+) -> SurfaceView:
+    share = None if stays is None else share_at(stays, applied.valid.shape)
+    return surface_view(applied, image, config.rectify, config.fusion.far * alignment.range_90, share)
 
 
 class FullFuser:
@@ -58,16 +76,20 @@ class FullFuser:
     def __init__(self, voxel: float, config: DensifyConfig) -> None:
         self._config, self._volume = config, TsdfVolume(voxel, config.fusion)
         self._given: dict[str, Given] = {}
+        self._unsure: dict[str, float] = {}
 
     def add(self, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
         assert seen.frame is not None and seen.prediction is not None
-        prediction = seen.prediction
-        view = view_to_fuse(aligned.alignment, prediction, seen.frame.image, self._config, aligned.stays)
+        prediction, image, name = seen.prediction, seen.frame.image, aligned.keyframe.name
+        taken = sure(aligned.alignment, prediction, image, self._config.fusion)
+        view = _rectified(aligned.alignment, taken, image, self._config, aligned.stays)
         self._volume.integrate(view, aligned.keyframe.cam_from_map)
-        self._given[aligned.keyframe.name] = Given.of(view, prediction)
+        self._given[name] = Given.of(view, prediction)
+        self._unsure[name] = 1 - int(taken.valid.sum()) / max(int(prediction.valid.sum()), 1)
 
     def dense_map(self, submap: Submap, alignments: tuple[Alignment, ...], seen: Mapping[str, Seen]) -> DenseMap:
-        return with_contributions(DenseMap.of(self._volume, submap, alignments), self._given, seen)
+        found = with_contributions(DenseMap.of(self._volume, submap, alignments), self._given, seen)
+        return replace(found, unsure_share=float(np.mean(list(self._unsure.values() or [0.0]))))
 
 
 class PaperFuser:

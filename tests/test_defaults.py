@@ -17,8 +17,19 @@ from densify.fusion.volume import FusionConfig
 from lightdepth.losses import LossConfig
 
 GOLDEN = Path(__file__).parent / "golden"
-CHANGED = {"agreement.shared_error": 0.03}
-"""Defaults that are newer than the golden runs, or have changed since."""
+CHANGED = {
+    "agreement.shared_error": 0.03,
+    "bending.slope_deviation": 0.25,
+    "bending.layers": 7,
+    "bending.columns": 3,
+    "bending.reach": 0.35,
+    "bending.layer_deviation": 0.1,
+    "rectify.feather": 0.15,
+    "fusion.front": 0.3,
+    "fusion.max_error": 9.0,
+}
+"""Defaults that are newer than the golden runs, or have changed since; docs/far-field.md has the figures of all but the
+first."""
 
 
 def recorded(run: str) -> tuple[dict, list[str]]:

@@ -167,7 +167,9 @@ def test_after_a_loop_closure_the_surface_is_that_of_a_fresh_run(moved):
 def test_a_map_that_changes_its_unit_is_made_again_in_the_new_one():
     frames, found, _ = setting()
     (submap,) = found.map.submaps
-    live = fed(Densifier(truth, ALONE), frames, submap)
+    # Rounding decides on pixels whose expected error is the limit, and along a round wall many are alike: without one.
+    alone = replace(ALONE, fusion=replace(ALONE.fusion, max_error=1000.0))
+    live = fed(Densifier(truth, alone), frames, submap)
     before = live.dense_map()
     poses = {}
     for k in submap.keyframes:
