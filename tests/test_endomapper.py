@@ -183,14 +183,14 @@ def test_synth_refuses_a_lens_that_the_layout_cannot_hold(tmp_path, capsys):
 def test_a_real_frame_with_the_sample_calibration_is_read(realdata, tmp_path):
     assets = realdata / "endomapper_assets"
     (tmp_path / "images").mkdir()
-    shutil.copy(assets / "sample_frame.png", tmp_path / "images" / "out1.png")
+    shutil.copyfile(assets / "sample_frame.png", tmp_path / "images" / "out1.png")
     for name in ("Endoscope_sample_geometrical.xml", "Endoscope_sample_photometrical.xml", "mask.png"):
-        shutil.copy(assets / name, tmp_path / name)
+        shutil.copyfile(assets / name, tmp_path / name)
     (frame,) = open_sequence(tmp_path)
     assert (
         frame.camera == ENDOMAPPER.with_pixel_center(0.0) == read_camera(tmp_path / "Endoscope_sample_geometrical.xml")
     )
     assert frame.light.mu == 2.767302 and frame.mask.mean() == pytest.approx(0.871, abs=1e-3)
     assert frame.valid[frame.mask].all()  # the lens can be inverted everywhere in the octagon
-    shutil.copy(assets / "mask_endomapper_gluefactory.png", tmp_path / "mask.png")  # the other polarity
+    shutil.copyfile(assets / "mask_endomapper_gluefactory.png", tmp_path / "mask.png")  # the other polarity
     assert (open_sequence(tmp_path)[0].mask & frame.mask).sum() > 0.95 * frame.mask.sum()

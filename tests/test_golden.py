@@ -65,7 +65,7 @@ def test_the_settings_of_a_run_of_0_1_0_are_taken_as_they_are_but_for_those_that
         found = parsed("densify", GOLDEN / "densified" / "config.yaml")
     assert len(warned) == 2
     then = yaml.safe_load((GOLDEN / "densified" / "config.yaml").read_text())
-    assert found["checkpoint"] == then["checkpoint"]
+    assert found["predicting"].checkpoint == then["checkpoint"]
     assert found["merging"].min_agreeing == then["merging"]["min_agreeing"]
 
 
