@@ -17,11 +17,11 @@ from densify.predictions import SeenKeyframe
 from lightdepth.reporting.figures import (
     BAD,
     GOOD,
+    MeshView,
     chart,
     chart_png,
     colored_distance,
     marked_points,
-    mesh_picture,
     png,
     side_by_side,
     thumbnail,
@@ -235,21 +235,24 @@ def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:
 
 
 def mesh_pictures(dense: DenseMap, name: str = "") -> list[tuple[bytes, str]]:
-    """The surface from outside, and from the place of the middle keyframe."""
+    """The surface from outside and from the place of the middle keyframe: in its colours, its shape alone, and by how
+    well it was seen."""
     name = name or f"map {dense.submap.id}"
-    surface = (dense.vertices, dense.triangles, dense.colors)
-    pictures = [(png(mesh_picture(*surface)), f"Surface of {name} from outside")]
-    keyframes = dense.submap.keyframes
-    middle = keyframes[len(keyframes) // 2]
-    inside = mesh_picture(*surface, origin=middle.center, axes=middle.cam_from_map[:3, :3])
-    pictures.append((png(inside), f"… and from keyframe {middle.name}"))
+    middle = dense.submap.keyframes[len(dense.submap.keyframes) // 2]
+    outside = MeshView.of(dense.vertices, dense.triangles)
+    inside = MeshView.of(dense.vertices, dense.triangles, origin=middle.center, axes=middle.cam_from_map[:3, :3])
+    ways: list[tuple[np.ndarray | None, str]] = [
+        (dense.colors, f"Surface of {name} from outside"),
+        (None, "Its shape without its colour"),
+    ]
     if dense.weights is not None and dense.confidence is not None:
         weak = np.where(dense.confidence[:, None] < _TRUSTED, DOUBTFUL, SEEN_WEAKLY)
         colors = np.where(seen_well(dense)[:, None], SEEN_WELL, weak)
-        seen = (dense.vertices, dense.triangles, colors)
-        inside = mesh_picture(*seen, origin=middle.center, axes=middle.cam_from_map[:3, :3])
-        text = f"Seen well (green), weakly (orange), or of a confidence below {_TRUSTED} (red)"
-        pictures += [(png(mesh_picture(*seen)), text), (png(inside), f"… and from keyframe {middle.name}")]
+        ways.append((colors, f"Seen well (green), weakly (orange), or of a confidence below {_TRUSTED} (red)"))
+    pictures = []
+    for colored, text in ways:
+        pictures.append((png(outside.picture(colored)), text))
+        pictures.append((png(inside.picture(colored)), f"… and from keyframe {middle.name}"))
     return pictures
 
 

@@ -10,12 +10,12 @@ import trimesh
 from lightdepth.reporting.figures import (
     BAD,
     GOOD,
+    MeshView,
     chart,
     chart_png,
     colored_distance,
     contact_sheet,
     marked_points,
-    mesh_picture,
     png,
     side_by_side,
     thumbnail,
@@ -81,17 +81,19 @@ def test_a_mesh_is_seen_from_outside_and_from_a_place_of_its_own():
     mesh = trimesh.creation.icosphere(3, 2.0)
     vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     colors = np.tile([1.0, 0.2, 0.2], (len(vertices), 1))
-    outside = mesh_picture(vertices, triangles, colors, (80, 60))
+    outside = MeshView.of(vertices, triangles, (80, 60)).picture(colors)
     assert (outside[0, 0] == 255).all() and outside[30, 40, 0] > 1.5 * outside[30, 40, 1]
-    inside = mesh_picture(vertices, triangles, colors, (80, 60), np.zeros(3), np.eye(3))
+    shape = MeshView.of(vertices, triangles, (80, 60)).picture()
+    assert shape[30, 40].min() > 100 and np.ptp(shape[30, 40].astype(int)) < 16 and (shape[0, 0] == 255).all()
+    inside = MeshView.of(vertices, triangles, (80, 60), np.zeros(3), np.eye(3)).picture(colors)
     assert not (inside == 255).all(-1).any()
-    away = mesh_picture(vertices, triangles, colors, (80, 60), np.array([0, 0, 10.0]), np.eye(3))
+    away = MeshView.of(vertices, triangles, (80, 60), np.array([0, 0, 10.0]), np.eye(3)).picture(colors)
     assert (away == 255).all()
 
 
 def test_a_mesh_of_nothing_is_a_white_picture():
     empty = np.zeros((0, 3))
-    assert (mesh_picture(empty, empty.astype(int), empty, (8, 6)) == 255).all()
+    assert (MeshView.of(empty, empty.astype(int), (8, 6)).picture(empty) == 255).all()
 
 
 def test_a_chart_needs_no_display(monkeypatch):

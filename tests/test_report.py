@@ -97,7 +97,7 @@ def test_the_report_of_a_run_shows_surfaces_scales_points_and_agreement(made, tm
     densify_page("Maps", results, gallery, ["a note"]).write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     page = check_self_contained(tmp_path / "report.html")
-    assert len(page.found) == 4 + 1 + len(gallery.pictures[0]) >= 5
+    assert len(page.found) == 6 + 1 + len(gallery.pictures[0]) >= 5
     for part in ("a note", "4 of 4", "Agreement", "hidden blocks", "constant, bent", "Scale of each keyframe", "Time"):
         assert part in text
     assert "Errors against the truth" not in text

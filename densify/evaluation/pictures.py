@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from densify.evaluation.records import EDGES_MM, DepthJudged, ErrorMesh, Evaluation, MapsJudged
-from lightdepth.reporting.figures import chart, chart_png, mesh_picture, png, side_by_side
+from lightdepth.reporting.figures import MeshView, chart, chart_png, png, side_by_side
 
 MODELS = {"sparse": "Sparse map", "sparse_inliers": "Sparse inliers", "dense": "Dense"}
 """The names of the point clouds, for people."""
@@ -51,7 +51,7 @@ def write_error_mesh(mesh: ErrorMesh, path: Path) -> None:
 
 def error_picture(mesh: ErrorMesh) -> bytes:
     """The coloured surface from outside, and what the colours mean."""
-    picture = mesh_picture(mesh.vertices, mesh.triangles, error_colors(mesh.distance))
+    picture = MeshView.of(mesh.vertices, mesh.triangles).picture(error_colors(mesh.distance))
     height, top, bottom = picture.shape[0], 70, 40
     scale = np.full((height, 150, 3), 255, np.uint8)
     steps = np.linspace(_COLOR_MM, 0, height - top - bottom)

@@ -31,10 +31,14 @@ _Schema = TypeVar("_Schema", bound=BaseModel)
 
 
 def inside(name: str) -> str:
-    """The name of a folder below the data's root, or InputError when it leads anywhere else."""
+    """The name of a folder below the data's root, or InputError when it leads anywhere else, or can be of no folder."""
     parts = name.replace("\\", "/").split("/")
     if not name.strip() or name.startswith(("/", "~")) or ".." in parts or ":" in parts[0]:
         raise InputError(repr(name), "leads outside the data's root", "expected the name of a folder below it")
+    longest = max(len(part.encode("utf-8", "surrogatepass")) for part in parts)
+    if longest > 255 or len(name) > 1000 or "\0" in name:
+        said = "a zero" if "\0" in name else f"{longest} bytes in one part" if longest > 255 else f"{len(name)} letters"
+        raise InputError(f"{name[:40]!r} ...", f"no folder has such a name: {said}", "expected one that can be there")
     return "/".join(part for part in parts if part not in ("", "."))
 
 

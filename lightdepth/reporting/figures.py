@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -12,6 +13,8 @@ import numpy as np
 from lightdepth import native
 
 GOOD, BAD, KEPT = (0, 200, 80), (235, 40, 40), (255, 170, 0)
+PLAIN = (0.82, 0.8, 0.78)
+"""of a surface that is shown without its colour"""
 
 
 def png(image: np.ndarray) -> bytes:
@@ -111,43 +114,60 @@ def chart_png(figure: Any) -> bytes:
     return buffer.getvalue()
 
 
-def mesh_picture(
-    vertices: np.ndarray,
-    triangles: np.ndarray,
-    colors: np.ndarray,
-    size: tuple[int, int] = (640, 480),
-    origin: np.ndarray | None = None,
-    axes: np.ndarray | None = None,
-    focal: float = 0.6,
-) -> np.ndarray:
-    """A mesh (vertices (n, 3), triangles (m, 3), colors (n, 3) in [0, 1]) as an image (H, W, 3) uint8 on white.
+@dataclass(frozen=True)
+class MeshView:
+    """What each pixel of a picture of a mesh sees, to be coloured in one way and another."""
 
-    From outside, obliquely, in parallel projection, unless `origin` (3,) and `axes` (3, 3; rows right, down, forward)
-    put a pinhole of focal length `focal` times the width at a place of their own.
-    """
-    width, height = size
-    if not len(triangles):
-        return np.full((height, width, 3), 255, np.uint8)
-    o3d = native.open3d()
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32)))
-    u, v = np.meshgrid((np.arange(width) + 0.5) / width - 0.5, ((np.arange(height) + 0.5) - height / 2) / width)
-    if origin is None or axes is None:
-        origins, directions = _outside(vertices, u, v, height / width)
-    else:
-        directions = np.stack([u / focal, v / focal, np.ones_like(u)], -1) @ axes
-        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-        origins = np.broadcast_to(origin, directions.shape)
-    hit = scene.cast_rays(o3d.core.Tensor(np.concatenate([origins, directions], -1).astype(np.float32)))
-    met = np.isfinite(hit["t_hit"].numpy())
-    corners = triangles[hit["primitive_ids"].numpy()[met]]
-    weights = hit["primitive_uvs"].numpy()[met]
-    weights = np.concatenate([1 - weights.sum(-1, keepdims=True), weights], -1)
-    color = (colors[corners] * weights[..., None]).sum(1)
-    shade = 0.35 + 0.65 * np.abs((hit["primitive_normals"].numpy()[met] * directions[met]).sum(-1, keepdims=True))
-    picture = np.ones((height, width, 3))
-    picture[met] = np.clip(color * shade, 0, 1)
-    return np.rint(picture * 255).astype(np.uint8)
+    met: np.ndarray
+    """(H, W) bool, whether a ray meets the mesh"""
+    corners: np.ndarray
+    """(k, 3), the vertices of the triangle that each of these k rays meets"""
+    weights: np.ndarray
+    """(k, 3), of the corners"""
+    shade: np.ndarray
+    """(k,), of light that comes from the camera"""
+
+    @classmethod
+    def of(
+        cls,
+        vertices: np.ndarray,
+        triangles: np.ndarray,
+        size: tuple[int, int] = (640, 480),
+        origin: np.ndarray | None = None,
+        axes: np.ndarray | None = None,
+        focal: float = 0.6,
+    ) -> MeshView:
+        """Of a mesh (vertices (n, 3), triangles (m, 3)) in a picture of `size` (W, H).
+
+        From outside, obliquely, in parallel projection, unless `origin` (3,) and `axes` (3, 3; rows right, down,
+        forward) put a pinhole of focal length `focal` times the width at a place of their own.
+        """
+        width, height = size
+        if not len(triangles):
+            return cls(np.zeros((height, width), bool), np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros(0))
+        o3d = native.open3d()
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32)))
+        u, v = np.meshgrid((np.arange(width) + 0.5) / width - 0.5, ((np.arange(height) + 0.5) - height / 2) / width)
+        if origin is None or axes is None:
+            origins, directions = _outside(vertices, u, v, height / width)
+        else:
+            directions = np.stack([u / focal, v / focal, np.ones_like(u)], -1) @ axes
+            directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+            origins = np.broadcast_to(origin, directions.shape)
+        hit = scene.cast_rays(o3d.core.Tensor(np.concatenate([origins, directions], -1).astype(np.float32)))
+        met = np.isfinite(hit["t_hit"].numpy())
+        weights = hit["primitive_uvs"].numpy()[met]
+        weights = np.concatenate([1 - weights.sum(-1, keepdims=True), weights], -1)
+        shade = 0.35 + 0.65 * np.abs((hit["primitive_normals"].numpy()[met] * directions[met]).sum(-1))
+        return cls(met, triangles[hit["primitive_ids"].numpy()[met]], weights, shade)
+
+    def picture(self, colors: np.ndarray | None = None) -> np.ndarray:
+        """(H, W, 3) uint8 on white, from colours (n, 3) in [0, 1] of the vertices; of the shape alone without them."""
+        picture = np.full((*self.met.shape, 3), 255, np.uint8)
+        color = PLAIN if colors is None else np.einsum("kci,kc->ki", colors[self.corners], self.weights)
+        picture[self.met] = np.rint(255 * np.clip(color * self.shade[:, None], 0, 1))
+        return picture
 
 
 def _outside(vertices: np.ndarray, u: np.ndarray, v: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:

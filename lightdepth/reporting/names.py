@@ -135,7 +135,7 @@ class Names:
     def _of_paths(self) -> Callable[[str], str]:
         """Replaces paths; those of a single word are left to arguments, where it is known that a path is meant."""
         several = {form: name for form, name in self._forms.items() if len(Path(form).parts) > 1 and form != os.sep}
-        return _replacing(several, before=r"(?<![\w.-])", relative=r"(?<![\w/.-])", after=r"(?![\w-])")
+        return _replacing(several, before=r"[\w.-]", relative=r"[\w/.-]", after=r"(?![\w-])")
 
     @cached_property
     def _words(self) -> Callable[[str], str]:
@@ -147,7 +147,7 @@ class Names:
                     for word in (part, Path(part).stem) if up == 0 else (part,):
                         if tells(word):
                             words.setdefault(word, name + "/.." * up)
-        return _replacing(words, before=r"(?<![\w-])", relative=r"(?<![\w-])", after=r'(?![\w-])(?!"\s*:)')
+        return _replacing(words, before=r"[\w-]", relative=r"[\w-]", after=r'(?![\w-])(?!"\s*:)')
 
 
 def tells(word: str) -> bool:
@@ -268,7 +268,8 @@ def _whole(path: str) -> tuple[Path, ...]:
 
 
 def _replacing(forms: Mapping[str, str], before: str, relative: str, after: str) -> Callable[[str], str]:
-    """A function that replaces texts, the longest first, also as HTML, JSON, YAML and LaTeX spell them."""
+    """A function that replaces texts, the longest first, also as HTML, JSON, YAML and LaTeX spell them; not where a
+    letter of `before` stands before them, or of `relative` before those that do not begin at the root."""
     spelled: dict[str, str] = {}
     for form, name in forms.items():
         in_json = json.dumps(form)[1:-1]
@@ -278,10 +279,10 @@ def _replacing(forms: Mapping[str, str], before: str, relative: str, after: str)
             spelled.setdefault(text, name)
     if not spelled:
         return lambda text: text
-    ways = [
-        f"{before if text.startswith(os.sep) else relative}{re.escape(text)}"
-        for text in sorted(spelled, key=lambda text: (-len(text), text))
-    ]
+    ways = []  # what may not stand before is asked last: a pattern that begins with letters is found much faster
+    for text in sorted(spelled, key=lambda text: (-len(text), text)):
+        word, unlike = re.escape(text), before if text.startswith(os.sep) else relative
+        ways.append(f"{word}(?<!{unlike}{word})")
     pattern, hints = re.compile(f"(?:{'|'.join(ways)}){after}"), tuple(spelled)
     return lambda text: (
         pattern.sub(lambda found: spelled[found[0]], text) if any(hint in text for hint in hints) else text
