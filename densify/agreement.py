@@ -26,6 +26,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse.linalg import spsolve
 
 from densify.bending import Bend, BendingConfig
@@ -36,6 +37,7 @@ from lightdepth.ranges import above, at_least, checked
 from lightdepth.robust import lower_quartile, mad_sigma, robust_weights
 from lightdepth.sparse_map import Keyframe
 
+_DENSE = 1200  # unknowns up to which one dense matrix is solved faster than a sparse one
 _STEP = 1e-3  # of log distance, to differentiate by
 _CELLS = 8  # across and down an image: parts whose points share their errors
 _WIDTH = 2.0  # sigmas; half weight at 1.3 of them, so that fewer good residuals are lost
@@ -150,7 +152,8 @@ class _Rows:
 def _step(rows: Sequence[_Rows], prior: np.ndarray, pull: np.ndarray, views: int) -> np.ndarray | None:
     """Solves (J' W J + diag(prior)) step = J' W r - pull; None where it has no solution.
 
-    J' W J is built block by block: views that do not meet have none. One block is dense and solved as that.
+    J' W J is built block by block, its lower half alone: views that do not meet have none. A few blocks are solved as
+    one dense matrix, many as a sparse one.
     """
     unknowns = len(prior) // views
     blocks = {(i, i): np.diag(part) for i, part in enumerate(np.split(prior, views))}
@@ -160,18 +163,24 @@ def _step(rows: Sequence[_Rows], prior: np.ndarray, pull: np.ndarray, views: int
             weighted = (of_i * r.weight[:, None]).T
             right[i] += weighted @ r.residual
             for j, of_j in r.blocks.items():
-                blocks[i, j] = blocks.get((i, j), 0) + weighted @ of_j
-    if views == 1:
+                if j <= i:
+                    blocks[i, j] = blocks.get((i, j), 0) + weighted @ of_j
+    if len(prior) <= _DENSE:
+        matrix = np.zeros((views, unknowns, views, unknowns))
+        for (i, j), block in blocks.items():
+            matrix[i, :, j] = block
         try:
-            step = np.linalg.solve(blocks[0, 0], right[0])
+            factor = cho_factor(matrix.reshape(len(prior), -1), lower=True, overwrite_a=True, check_finite=False)
+            step = cho_solve(factor, right.ravel(), check_finite=False)
         except np.linalg.LinAlgError:
             return None
     else:
+        blocks |= {(j, i): block.T for (i, j), block in blocks.items() if i != j}
         order = sorted(blocks)
         first = np.searchsorted([i for i, _ in order], np.arange(views + 1))
         data = np.stack([blocks[place] for place in order])
         matrix = sparse.bsr_matrix((data, [j for _, j in order], first), (len(prior), len(prior)))
-        step = spsolve(matrix.tocsc(), right.ravel())
+        step = spsolve(matrix.tocsc(), right.ravel(), permc_spec="MMD_AT_PLUS_A")
     return step if np.isfinite(step).all() else None
 
 
@@ -343,5 +352,5 @@ def gap_between(view: View, other: View, bend: Bend, rays: np.ndarray, log_d: np
     x = np.where(seen[:, None], pixels / (camera.width, camera.height), 0.5)
     log_predicted, known = other.at(x)
     log_reach = np.log(np.linalg.norm(points, axis=1).clip(min=1e-12))
-    d = log_predicted + bend.basis(x, log_predicted) @ bend.weights
+    d = log_predicted + bend.along(x, log_predicted)
     return OverlapGap(log_reach - d, seen & known, x, log_predicted, log_reach)

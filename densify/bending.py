@@ -109,6 +109,25 @@ class Bend(Brief):
             parts += [layers, (layers[:, :, None] * own).reshape(len(x), -1)]
         return np.concatenate(parts, 1)
 
+    def along(self, x: np.ndarray, log_distance: np.ndarray) -> np.ndarray:
+        """f (n,) at x (n, 2) in [0, 1]² and log predicted distance (n,): basis(...) @ weights, without the matrix."""
+        value = np.full(len(x), self.weights[0])
+        if not self.config.on:
+            return value
+        used = 1
+        if self.config.slope_deviation:
+            value += self.weights[1] * (np.clip(log_distance, *self.log_range) - self.log_middle)
+            used = 2
+        for n in self.config.grids:
+            value += _on_grid(x, self.weights[used : used + n * n].reshape(1, n, n))[0]
+            used += n * n
+        count, n = self.config.layers, self.config.columns
+        if count:
+            own = _on_grid(x, self.weights[used + count :].reshape(count, n, n))
+            for k in range(count):
+                value += self._layer(log_distance, k) * (self.weights[used + k] + own[k])
+        return value
+
     def _layer(self, log_distance: np.ndarray, k: int) -> np.ndarray:
         """The bump of layer k at log distances, of their shape and precision."""
         middle = self.log_middle + (k - (self.config.layers - 1) / 2) * self.config.reach
@@ -118,8 +137,7 @@ class Bend(Brief):
 
     def at(self, pixels: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """f (n,) at pixels (n, 2) with predicted distance (n,)."""
-        result: np.ndarray = self.basis(pixels / self.image_size, np.log(predicted)) @ self.weights
-        return result
+        return self.along(pixels / self.image_size, np.log(predicted))
 
     def field(self, log_distance: np.ndarray) -> np.ndarray:
         """f (H, W) over an image of log predicted distances (H, W)."""
@@ -150,6 +168,14 @@ class Bend(Brief):
         """The bent prediction, in map units."""
         log_distance = np.log(np.where(prediction.valid, prediction.distance, 1)).astype(np.float32)
         return replace(prediction, distance=np.exp(log_distance + self.field(log_distance)), unit="map units")
+
+
+def _on_grid(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Bumps at x (n, 2), less their means, weighted in several ways (k, rows, columns): (k, n)."""
+    n = weights.shape[1]
+    across, down, mean = _bumps(x[:, 0], n), _bumps(x[:, 1], n), _mean(n)
+    result: np.ndarray = ((down @ weights) * across).sum(-1) - (mean @ weights @ mean)[:, None]
+    return result
 
 
 def _bumps(x: np.ndarray, n: int) -> np.ndarray:

@@ -66,7 +66,7 @@ def uncontradicted(
         camera = view.keyframe.camera
         rays, _ = camera.unproject(x * (camera.width, camera.height))
         log_b, _ = view.at(x)
-        log_d = log_b + bends[a].basis(x, log_b) @ bends[a].weights
+        log_d = log_b + bends[a].along(x, log_b)
         own = _cells(x, shapes[a])
         for b in _judges(shared[a], a, config.judges):
             found = gap_between(view, views[b], bends[b], rays, log_d)

@@ -38,8 +38,10 @@ def rows_of(rng: np.random.Generator, views: tuple[int, ...], m: int, n: int = 7
     return _Rows(rng.normal(size=n), rng.uniform(0.5, 2, n), {i: rng.normal(size=(n, m)) for i in views})
 
 
+@pytest.mark.parametrize("dense", [0, 1000])
 @pytest.mark.parametrize("views", [1, 3])
-def test_the_step_is_that_of_the_dense_normal_equations(views):
+def test_the_step_is_that_of_the_dense_normal_equations(views, dense, monkeypatch):
+    monkeypatch.setattr("densify.agreement._DENSE", dense)
     rng, m = np.random.default_rng(0), 3
     rows = [rows_of(rng, (i,), m) for i in range(views)]
     if views > 1:
@@ -56,8 +58,10 @@ def test_the_step_is_that_of_the_dense_normal_equations(views):
 
 
 @pytest.mark.filterwarnings("ignore::scipy.sparse.linalg.MatrixRankWarning")
+@pytest.mark.parametrize("dense", [0, 1000])
 @pytest.mark.parametrize("views", [1, 2])
-def test_where_nothing_holds_an_unknown_there_is_no_step(views):
+def test_where_nothing_holds_an_unknown_there_is_no_step(views, dense, monkeypatch):
+    monkeypatch.setattr("densify.agreement._DENSE", dense)
     rows = [_Rows(np.ones(2), np.ones(2), {0: np.array([[1.0, 0], [1, 0]])})]
     assert _step(rows, np.zeros(2 * views), np.zeros(2 * views), views) is None
 

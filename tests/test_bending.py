@@ -36,6 +36,8 @@ def test_an_image_is_bent_as_its_pixels_are(grids, slope, layers, columns):
     factor = np.exp(bend.at(np.stack([columns, rows], -1) + 0.5, predicted))
     assert bend.applied(flat).distance[rows, columns] == pytest.approx(predicted * factor, rel=1e-5)
     assert bend.applied(flat).unit == "map units"
+    x, log = np.random.default_rng(1).uniform(0, 1, (40, 2)), np.random.default_rng(2).uniform(2, 5, 40)
+    assert bend.along(x, log) == pytest.approx(bend.basis(x, log) @ bend.weights, rel=1e-12)
 
 
 def test_without_slope_the_first_weight_is_the_mean_of_the_field():
