@@ -159,12 +159,13 @@ def _step(rows: Sequence[_Rows], prior: np.ndarray, pull: np.ndarray, views: int
     blocks = {(i, i): np.diag(part) for i, part in enumerate(np.split(prior, views))}
     right = -pull.reshape(views, unknowns)
     for r in rows:
-        for i, of_i in r.blocks.items():
-            weighted = (of_i * r.weight[:, None]).T
-            right[i] += weighted @ r.residual
-            for j, of_j in r.blocks.items():
+        root = np.sqrt(r.weight)[:, None]  # numpy makes but half of the product of a matrix with its own transpose
+        weighted = {i: of_i * root for i, of_i in r.blocks.items()}
+        for i, of_i in weighted.items():
+            right[i] += of_i.T @ (root[:, 0] * r.residual)
+            for j, of_j in weighted.items():
                 if j <= i:
-                    blocks[i, j] = blocks.get((i, j), 0) + weighted @ of_j
+                    blocks[i, j] = blocks.get((i, j), 0) + of_i.T @ of_j
     if len(prior) <= _DENSE:
         matrix = np.zeros((views, unknowns, views, unknowns))
         for (i, j), block in blocks.items():

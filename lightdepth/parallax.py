@@ -216,6 +216,12 @@ class _Sweep:
     def shape(self) -> tuple[int, int]:
         return len(self.guess), len(_HYPOTHESES)
 
+    @property
+    def corners(self) -> list[int]:
+        """Of the grid: what they see within an image, all of a patch does."""
+        across = round(len(self.grid) ** 0.5)
+        return [0, across - 1, len(self.grid) - across, len(self.grid) - 1]
+
     @classmethod
     def of(cls, look: Look, pixels: np.ndarray, guess: np.ndarray, patch: int) -> _Sweep:
         camera: CameraModel = look.keyframe.camera
@@ -228,7 +234,8 @@ class _Sweep:
         half = patch // 2
         grid = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), -1).reshape(-1, 2)
         own = _sampled(look.brightness, pixels[:, None] + grid)
-        return cls(np.log(distance[:, 0]), known, own - own.mean(1, keepdims=True), places, grid.astype(float))
+        own -= own.mean(1, keepdims=True)
+        return cls(np.log(distance[:, 0]), known, own, places, grid.astype(np.float32))
 
     def compared(self, look: Look, other: Look) -> tuple[np.ndarray, np.ndarray]:
         """NCC (n, k) of every hypothesis with what another keyframe shows, 0 where it does not see it, and whether it
@@ -239,12 +246,14 @@ class _Sweep:
         projected = np.where(seen[:, None], projected, -1e3).reshape(*self.shape, 3, 2)
         middle = projected[:, :, 0]
         beside = (projected[:, :, 1:] - middle[:, :, None]) / _BESIDE
-        at = middle[:, :, None] + self.grid @ beside
+        at = (middle[:, :, None] - 0.5).astype(np.float32) + self.grid @ beside.astype(np.float32)
         height, width = other.usable.shape
-        inside = seen.reshape(*self.shape, 3).all(2) & ((at >= 0.5) & (at <= (width - 0.5, height - 0.5))).all((2, 3))
+        ends = at[:, :, self.corners]
+        inside = seen.reshape(*self.shape, 3).all(2) & ((ends >= 0) & (ends <= (width - 1, height - 1))).all((2, 3))
         cell = np.clip(middle.astype(int), 0, (width - 1, height - 1))
         inside &= other.usable[cell[..., 1], cell[..., 0]]
-        values = _sampled(other.brightness, at.reshape(self.shape[0], -1, 2)).reshape(*self.shape, -1)
+        places = at.reshape(self.shape[0], -1, 2)
+        values = cv2.remap(other.brightness, places[..., 0], places[..., 1], cv2.INTER_LINEAR).reshape(at.shape[:3])
         values -= values.mean(2, keepdims=True)
         size = np.sqrt((values**2).sum(2)) * np.sqrt((self.own**2).sum(1))[:, None]
         score = np.einsum("nkq,nq->nk", values, self.own) / np.maximum(size, 1e-9)
