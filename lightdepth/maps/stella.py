@@ -73,14 +73,13 @@ def read_stella(path: Path, reader: Reader = Reader(), map_id: int = 0, begun: B
         raise InputError(path, "landmarks: no points in it", "an empty map cannot be densified, leave it out")
     submap = assembled(path, map_id, keyframes, np.array(ids, np.int64), np.array(points).reshape(-1, 3))
     clock = cameras.clock(entries)
-    return replace(submap, localised=_localised(path, clock, begun), guessed_clock=_guesses(entries, clock))
+    return replace(submap, localised=_localised(path, _first(content), clock, begun), guessed_clock=_guesses(entries, clock))
 
 
-def _localised(path: Path, clock: Clock, begun: Begun) -> tuple[int, ...] | None:
+def _localised(path: Path, first: float | None, clock: Clock, begun: Begun) -> tuple[int, ...] | None:
     """Numbers of the frames in the trajectory beside a map, which may be of another run: where its first keyframe's
     time is not in it, nothing is known."""
     trajectory = path.parent / "frame_trajectory.txt"
-    first = first_stamp(path)
     if not trajectory.is_file() or first is None or len(list(path.parent.glob("*.msg"))) > 1:
         return None
     try:
@@ -204,7 +203,11 @@ def declared_rate(path: Path) -> float | None:
 
 def first_stamp(path: Path) -> float | None:
     """The first time of a map's keyframes; None where it tells none."""
-    entries = _content(path).get("keyframes")
+    return _first(_content(path))
+
+
+def _first(content: Mapping[str, Any]) -> float | None:
+    entries = content.get("keyframes")
     values = entries.values() if isinstance(entries, dict) else ()
     times = [entry.get("ts") for entry in values if isinstance(entry, dict)]
     return min((float(t) for t in times if isinstance(t, int | float)), default=None)
