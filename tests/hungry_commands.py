@@ -225,10 +225,10 @@ def run_limited(command: Command, here: Path) -> dict[str, object]:
 if __name__ == "__main__":
     from importlib import metadata
 
-    from lightdepth.cli import GROUP
+    from lightdepth.cli import GROUP, verb_parser
 
     for verb in sorted({row.typed.split()[0] for row in ROWS}):  # so that each process need not
         (entry,) = metadata.entry_points(group=GROUP, name=verb)
-        entry.load()
+        verb_parser(entry.load(), verb)
     for number in sys.argv[2:]:
         print(json.dumps(run_limited(ROWS[int(number)], Path(sys.argv[1]))), flush=True)
