@@ -73,7 +73,9 @@ def read_stella(path: Path, reader: Reader = Reader(), map_id: int = 0, begun: B
         raise InputError(path, "landmarks: no points in it", "an empty map cannot be densified, leave it out")
     submap = assembled(path, map_id, keyframes, np.array(ids, np.int64), np.array(points).reshape(-1, 3))
     clock = cameras.clock(entries)
-    return replace(submap, localised=_localised(path, _first(content), clock, begun), guessed_clock=_guesses(entries, clock))
+    return replace(
+        submap, localised=_localised(path, _first(content), clock, begun), guessed_clock=_guesses(entries, clock)
+    )
 
 
 def _localised(path: Path, first: float | None, clock: Clock, begun: Begun) -> tuple[int, ...] | None:

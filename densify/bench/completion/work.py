@@ -2,8 +2,9 @@
 
 Depth is judged keyframe by keyframe on every pixel that is valid in prediction and truth, below 100 mm, in the scale
 that the similarity of the trajectory gives; nothing is aligned once more. Each row's depth is fused in the same way, by
-densify's own volume without the step that leaves contradicted pixels out, as far as fusion.far reaches. The row
-`densify` is what the verb delivers: its bends as the images lessened them, and its surface.
+densify's own volume as far as fusion.far reaches and where it is expected to be right, without the step that leaves
+contradicted pixels out. The row `densify` is what the verb delivers: its bends as the images lessened them, and its
+surface.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import JudgedMap
 from densify.evaluation.records import SurfaceFigures
 from densify.evaluation.trajectory import align_trajectory, keyframe_trajectory
+from densify.fusers import sure
 from densify.fusion.rectify import surface_view
 from densify.fusion.volume import TsdfVolume
 from densify.pipeline import densify
@@ -142,8 +144,10 @@ def fused(task: Task, completed: Completed) -> np.ndarray:
     for k in task.keyframes:
         frame, prediction = task.seen[k.keyframe.name].frame, completed.get(k.keyframe.name)
         if prediction is not None and frame is not None:
-            reach = fusion.far * k.alignment.range_90
-            volume.integrate(surface_view(prediction, frame.image, task.config.rectify, reach), k.keyframe.cam_from_map)
+            reach = k.alignment.range_90
+            taken = sure(prediction, reach, frame.image, fusion)
+            view = surface_view(taken, frame.image, task.config.rectify, fusion.far * reach)
+            volume.integrate(view, k.keyframe.cam_from_map)
     return volume.extract_mesh().vertices
 
 
