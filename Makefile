@@ -6,6 +6,8 @@ OUT ?= runs/demo
 export OMP_WAIT_POLICY = passive
 # Many small systems are solved, in several processes at once: threads of each would wait for each other in circles.
 export OPENBLAS_NUM_THREADS = 1
+# Some hundred processes import the same modules: compiled once, for all of them.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: setup demo test test-slow fuzz mutants kill soak offline coverage lint format bench same ablation ablation-paper clean
 

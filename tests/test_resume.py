@@ -157,7 +157,7 @@ def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(
     (tmp_path / "data" / "light.json").unlink()
     # Drawn from the arrays alone, and slowly: their sum tells as well whether they are the same.
     summed = lambda *of, **_: np.full((1, 1, 3), zlib.crc32(b"".join(a.tobytes() for a in of)) / 2**32)  # noqa: E731
-    monkeypatch.setattr(densify.page, "mesh_picture", summed)
+    monkeypatch.setattr(densify.page, "MeshView", summed)
     done, coarse = [], FusionConfig(voxels_per_distance=20.0)
     real = densify.densified.densify_or_empty
     monkeypatch.setattr(
