@@ -147,6 +147,21 @@ def test_import_goes_on_with_the_measures_and_pictures_that_it_has(few_frames, t
     assert len([p for p in parts if p.startswith("pictures")]) >= 3
 
 
+class Summed:
+    """A view that draws nothing but the sum of its arrays, which tells as well whether they are the same."""
+
+    def __init__(self, *arrays: np.ndarray) -> None:
+        self.arrays = arrays
+
+    @classmethod
+    def of(cls, *arrays: np.ndarray, **_: np.ndarray) -> Summed:
+        return cls(*arrays)
+
+    def picture(self, *colors: np.ndarray) -> np.ndarray:
+        every = b"".join(a.tobytes() for a in (*self.arrays, *colors) if a is not None)
+        return np.full((1, 1, 3), zlib.crc32(every) / 2**32)
+
+
 @pytest.mark.parametrize(("every", "judging"), [(3, False), pytest.param(1, True, marks=pytest.mark.slow)])
 def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(
     tmp_path, stopping, each_alone, monkeypatch, every, judging
@@ -155,9 +170,7 @@ def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(
     frames = colon(0).frames[:6]
     write_synthetic(frames, slam(frames, maps=2, shared_keyframes=2), tmp_path / "data")
     (tmp_path / "data" / "light.json").unlink()
-    # Drawn from the arrays alone, and slowly: their sum tells as well whether they are the same.
-    summed = lambda *of, **_: np.full((1, 1, 3), zlib.crc32(b"".join(a.tobytes() for a in of)) / 2**32)  # noqa: E731
-    monkeypatch.setattr(densify.page, "MeshView", summed)
+    monkeypatch.setattr(densify.page, "MeshView", Summed)
     done, coarse = [], FusionConfig(voxels_per_distance=20.0)
     real = densify.densified.densify_or_empty
     monkeypatch.setattr(
