@@ -41,6 +41,9 @@ from lightdepth.signals import ending_on_signals
 GROUP = "lightdepth.commands"
 KEEP_NAMES = """Write the paths of inputs as they are into run.json, log and reports. Without it they are called by the
 option and a hash of their contents, as paths are often names of patients, and inputs.json alone has the paths."""
+ONE_THREAD = "OPENBLAS_NUM_THREADS", "1"
+"""The systems that are solved are many and small. Threads of each would wait for each other, for long where a container
+or other work leaves fewer cores than the machine has."""
 ORDER = (
     "demo",
     "doctor",
@@ -66,6 +69,8 @@ def main(argv: list[str] | None = None) -> int:
     """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed, 5 the machine failed
     (disk, memory, a folder that is gone), 128 + n ended by signal n."""
     fill_closed_streams()
+    if argv is None:  # a process of its own, in which nothing is loaded yet
+        os.environ.setdefault(*ONE_THREAD)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show ends no run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -528,6 +529,15 @@ def test_the_demo_ends_at_a_report_with_errors_against_the_truth(tmp_path):
     assert lightdepth("demo", "-o", tmp_path / "demo", *argv) == 0
     assert {"data", "map_000", "map_001", "metrics.json", "report.html", "run.json"} <= set(left_in(tmp_path / "demo"))
     assert "Errors against the truth" in (tmp_path / "demo" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(("given", "had"), [(None, "1"), ("4", "4")])
+def test_small_systems_are_solved_on_one_thread_unless_somebody_says_otherwise(given, had, monkeypatch, capsys):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", given or "")
+    if given is None:
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    monkeypatch.setattr(sys, "argv", ["lightdepth", "--version"])
+    assert main() == 0 and os.environ["OPENBLAS_NUM_THREADS"] == had
 
 
 def test_exit_codes_reach_the_shell_without_a_traceback(tmp_path):
