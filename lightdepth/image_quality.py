@@ -87,7 +87,10 @@ def _dips(change: np.ndarray) -> np.ndarray:
 
 
 class RepeatFinder:
-    """Tells of frames that come one after the other which repeat the one before, without a look at what follows."""
+    """Tells of frames that come one after the other which repeat the one before, without a look at what follows, nor
+    at more than `LOOKS_BACK` frames before."""
+
+    LOOKS_BACK = _SHORT + 3
 
     def __init__(self) -> None:
         self._before: np.ndarray | None = None

@@ -46,7 +46,7 @@ VERBS = (
         "out",
         ("--size", "[192, 160]"),
     ),
-    Verb("select", ("select", "wide", "-o", "out/list.txt"), "out", ("--sift.ratio", "0.7")),
+    Verb("select", ("select", "wide", "-o", "out/list.txt"), "out", ("--sift.ratio", "0.7"), resumes=True),
     Verb(
         "train", ("train", "--config", "train.yaml", "-o", "out"), "out", ("--seed", "5"), resumes=True, in_place=True
     ),

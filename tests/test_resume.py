@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
 import shutil
 import warnings
@@ -9,11 +10,13 @@ import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from colons import colon, slam
+from raising import refused
 from same_results import differences
 from test_sfm import PINHOLE, film
 from verbs import by_options
@@ -31,7 +34,7 @@ from lightdepth.cli import main
 from lightdepth.commands.import_frames import import_frames as import_frames_verb
 from lightdepth.commands.predict import predict as predict_verb
 from lightdepth.datasets import write_folder
-from lightdepth.errors import PartialFailure
+from lightdepth.errors import AlreadyFinished, PartialFailure
 from lightdepth.files.packed import read_packed, write_packed
 from lightdepth.frame import Frame
 from lightdepth.losses import LossConfig
@@ -47,9 +50,12 @@ from lightdepth.sparse_map import Submap
 from lightdepth.tube import ShapeConfig, TubeConfig
 from lightdepth.tube.export import write_synthetic
 from train.commands.adapt import adapt as adapt_verb
+from train.commands.select import select as select_verb
+from train.selecting.covisibility import NodeRules
+from train.selecting.matching import SiftMatcher
 
 predict, import_frames = by_options(predict_verb), by_options(import_frames_verb)
-sparse, adapt = by_options(sparse_verb), by_options(adapt_verb)
+sparse, adapt, select = by_options(sparse_verb), by_options(adapt_verb), by_options(select_verb)
 densify_verb = by_options(densify.commands.densify.densify)
 
 
@@ -145,6 +151,59 @@ def test_import_goes_on_with_the_measures_and_pictures_that_it_has(few_frames, t
     parts = stopped_everywhere(verb, tmp_path, stopping, every=3)
     assert [p for p in parts if p.startswith("measures")] == [f"measures from {n}" for n in range(5)]
     assert len([p for p in parts if p.startswith("pictures")]) >= 3
+
+
+ALL_ARE_KEPT = NodeRules(min_views=1, min_frames=1, min_matches=4, min_spread=0.0)
+
+
+def test_select_goes_on_at_the_node_that_it_came_to(tmp_path, stopping, each_alone, monkeypatch):
+    """Three colons after each other; one frame comes twice, and one cannot be read."""
+    seen = [f for seed in (0, 1, 2) for f in colon(seed, 40).frames[:4]]
+    seen.insert(6, seen[5])
+    write_folder([replace(f, name=f"{n:06d}") for n, f in enumerate(seen)], tmp_path / "data")
+    torn = next(p for p in sorted((tmp_path / "data").rglob("*.png")) if p.stem == "000009")
+    torn.write_bytes(torn.read_bytes()[:300])
+    matched = []
+    real = SiftMatcher.keep
+    monkeypatch.setattr(SiftMatcher, "keep", lambda own, frame: matched.append(frame.name) or real(own, frame))
+
+    def verb(output: Path, **given) -> None:
+        output.mkdir(exist_ok=True)
+        select(tmp_path / "data", output / "list.txt", sift_nodes=ALL_ARE_KEPT, **given)
+
+    parts = stopped_everywhere(verb, tmp_path, stopping)
+    assert len(parts) > 3 and parts[-1] == "verdicts"
+    nodes = [row["node"] for row in csv.DictReader((tmp_path / "out" / "list.csv").open())]
+    assert len(set(nodes) - {""}) == len(parts) - 1 < 11, "some nodes are of several frames"
+    # What a node begins with is looked at again by the run that goes on there, but nothing before it.
+    assert len(matched) == 11 * 3 + len(parts) - 1
+    assert sorted(p.name for p in (tmp_path / "out").glob(".*")) == []
+    with pytest.raises(AlreadyFinished):
+        verb(tmp_path / "out", resume=True)
+    with refused("other frames or settings"):
+        select(tmp_path / "data", tmp_path / "out" / "list.txt", resume=True)
+    with refused("already there"):
+        verb(tmp_path / "out")
+
+
+def test_select_tells_of_a_run_that_was_stopped(tmp_path, stopping, each_alone):
+    write_folder(colon(0, 4).frames, tmp_path / "data")
+    chosen = partial(select, tmp_path / "data", sift_nodes=ALL_ARE_KEPT)
+    stopping(1)
+    with pytest.raises(Stopped):
+        chosen(tmp_path / "list.txt")
+    assert sorted(p.name for p in tmp_path.glob("*list*")) == [".list.txt.unfinished"]
+    stopping(None)
+    with refused("an unfinished run of select is beside it"):
+        chosen(tmp_path / "list.txt")
+    with refused("not resumed, --no-frames was False and is True"):
+        chosen(tmp_path / "list.txt", no_frames=True, resume=True)
+    chosen(tmp_path / "list.txt", overwrite=True)
+    assert (tmp_path / "list.txt").is_file() and not (tmp_path / ".list.txt.unfinished").exists()
+    (tmp_path / ".other.txt.unfinished").mkdir()
+    (tmp_path / ".other.txt.unfinished" / "mine").write_text("")
+    with refused("was not made by this program"):
+        chosen(tmp_path / "other.txt")
 
 
 class Summed:

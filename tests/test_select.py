@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from verbs import by_options
 
 from lightdepth.camera import Pinhole
 from lightdepth.datasets import write_folder
-from lightdepth.errors import InputError
+from lightdepth.errors import InputError, MachineFailure
 from lightdepth.frame import Frame
 from lightdepth.maps import write_text_model
 from lightdepth.sparse_map import SparseMap
@@ -335,9 +336,9 @@ def test_nothing_is_written_when_no_frame_is_kept_or_writing_fails(data, tmp_pat
     monkeypatch.setattr(
         "lightdepth.reporting.report.Report.write", lambda *_: (_ for _ in ()).throw(OSError(28, "disk full"))
     )
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(MachineFailure, match=r"the disk is full .*are kept: --resume goes on"):
         select(data, tmp_path / "b" / "list.txt")
-    assert not (tmp_path / "a").exists() and not (tmp_path / "b").exists()
+    assert not (tmp_path / "a").exists() and os.listdir(tmp_path / "b") == [".list.txt.unfinished"]
     for wrong in (tmp_path, tmp_path / "list.csv"):
         with refused(cure="name of a list"):
             select(data, wrong)

@@ -232,12 +232,17 @@ def recover(output: Path) -> bool:
         return _recover(output)
 
 
+def check_ours(path: Path, output: Path) -> None:
+    """Raises InputError where a hidden folder beside an output was not made by this program."""
+    if os.path.lexists(path) and not _is_of_a_run(path):
+        found = f"{path.name} beside it is in the way, and was not made by this program"
+        raise InputError(output, found, "rename it, or choose another -o")
+
+
 def _recover(output: Path) -> bool:
     made, aside = unfinished_path(output), old_path(output)
     for path in (made, aside):
-        if os.path.lexists(path) and not _is_of_a_run(path):
-            found = f"{path.name} beside it is in the way, and was not made by this program"
-            raise InputError(output, found, "rename it, or choose another -o")
+        check_ours(path, output)
     complete = read_record(made) is not None
     empty = not output.exists() or (output.is_dir() and not any(output.iterdir()))
     if aside.is_dir() and empty and not complete:

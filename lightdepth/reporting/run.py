@@ -258,7 +258,7 @@ def run_folder(
             run = Run(unfinished_path(real), real, verb, arguments, None if resume is None else parts)
             run.keep_names = KEPT.get() if keep_names is None else keep_names
             run.unlisted = {"input": inputs}
-            with _kept_or_gone(run, real, resume is not None), run.hearing():
+            with kept_or_gone(run, real, resume is not None), run.hearing():
                 _begin(run)
                 yield run
                 run.settle()
@@ -331,7 +331,7 @@ def _begin(run: Run) -> None:
 
 
 @contextmanager
-def _kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
+def kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
     """A block that fails leaves nothing, or, of a run that can be resumed, its finished parts."""
     try:
         yield

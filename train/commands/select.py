@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import csv
 import io
+import time
 import warnings
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, astuple, dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -20,16 +21,19 @@ from lightdepth.command_line.options import Group
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.coloured import colours_of
 from lightdepth.datasets.with_map import open_with_map
-from lightdepth.errors import InputError
+from lightdepth.errors import AlreadyFinished, InputError
 from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import Content, write_together
 from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
 from lightdepth.ranges import Range, checked
+from lightdepth.reporting import batches
+from lightdepth.reporting.beside import goes_on, kept_beside
 from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
 from lightdepth.reporting.names import told
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.report import Report
+from lightdepth.reporting.run import Run, recorded
 from lightdepth.sparse_map import SparseMap
 
 from ..selecting.covisibility import (
@@ -38,11 +42,20 @@ from ..selecting.covisibility import (
     FrameVerdict,
     MapRules,
     NodeRules,
+    Seen,
     published_pairs,
     select_by_map,
     select_by_matching,
 )
-from ..selecting.matching import LoftrMatcher, LoftrSettings, Matcher, OrientationDescriptor, SiftMatcher, SiftSettings
+from ..selecting.matching import (
+    LoftrMatcher,
+    LoftrSettings,
+    MatchAgreement,
+    Matcher,
+    OrientationDescriptor,
+    SiftMatcher,
+    SiftSettings,
+)
 
 _SHOWN = 48  # pictures of kept and of rejected frames each
 
@@ -52,6 +65,9 @@ _SHOWN = 48  # pictures of kept and of rejected frames each
 class SelectConfig:
     """What is covisible and what is kept, by each way of telling."""
 
+    matcher: Literal["sift", "loftr"] = "sift"
+    """What matches images where there is no --map: sift, by single features; loftr, by a network, which finds matches
+    on smoother tissue, takes longer and needs --loftr.weights. Its options begin with its name."""
     sift: SiftSettings = field(default_factory=SiftSettings)
     """features of the sift matcher"""
     sift_nodes: NodeRules = SIFT_NODES
@@ -71,7 +87,6 @@ def select(
     data: Path,
     output: Path,
     map: Path | None = None,
-    matcher: Literal["sift", "loftr"] = "sift",
     format: FormatName | None = None,
     camera: Path | None = None,
     mask: Path | None = None,
@@ -80,6 +95,7 @@ def select(
     with_folder: bool = False,
     no_frames: bool = False,
     overwrite: bool = False,
+    resume: bool = False,
 ) -> None:
     """The frames worth training on, by covisibility: not blur, water, stool, nor walls too near.
 
@@ -89,8 +105,6 @@ def select(
             (.csv), a sheet of pictures (_contact.png) and a page (.html).
         map: Sparse map of the frames (a SLAM export or a COLMAP model): which keyframes see the same wall (are
             covisible) is then read from it, by --map-rules, and no images are matched.
-        matcher: What matches images where there is no --map: sift, by single features; loftr, by a network, which finds
-            matches on smoother tissue, takes longer and needs --loftr.weights. Its options begin with its name.
         format: Format of the frames: folder (images with camera.json), video, or the data set c3vd, simcol, hamlyn,
             scared, endoslam or endomapper. Left out, it is told by the files.
         camera: Calibration file of the camera, used instead of the folder's own; left out, the folder's, else the
@@ -102,62 +116,122 @@ def select(
         no_frames: Leave out all pictures: the sheet is not written, and the page has none. Without it, both show
             frames.
         overwrite: Replace the files of an earlier run. Without it, files that are already there are refused.
+        resume: Go on with the run that was stopped there, as it was begun; frames that were looked at are not matched
+            again.
     """
-    paths = _paths(output)
-    check_files(paths.values(), overwrite, [data, map, camera, mask])
+    if resume and overwrite:
+        raise InputError("--resume, --overwrite", "they contradict each other", "give one of them")
+    paths, going_on = _paths(output), resume and goes_on(output)
+    # A run that goes on may have been begun by --overwrite; one that is finished is looked at before it is refused.
+    check_files(paths.values(), overwrite or going_on or (resume and output.is_file()), [data, map, camera, mask])
     if output.resolve().parent == data.resolve() and not no_frames and any(c.isdigit() for c in output.stem):
         found = f"{paths['sheet'].name}, among the frames, would be taken for one: it has a number"
         raise InputError("-o", found, "choose a name without digits, another folder, or --no-frames")
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=config.bit_depth)
     sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, reading)
     frames = frames.without_truth()
-    doubts = colours_of(frames).doubts
-    for doubt in doubts:
-        warnings.warn(f"{data}: {doubt}", stacklevel=2)
-    settings: dict[str, object]
-    if sparse_map is not None and map is not None:
-        verdicts, how = _by_map(frames, sparse_map, map, config.map_rules)
-        settings = {"map": str(map), **asdict(config.map_rules)}
-    else:
-        used: Matcher = SiftMatcher(config.sift) if matcher == "sift" else LoftrMatcher(config.loftr)
-        nodes = config.sift_nodes if matcher == "sift" else config.loftr_nodes
-        settings = {"matcher": matcher, **asdict(nodes), **asdict(config.sift if matcher == "sift" else config.loftr)}
-        how = f"frames matched with {matcher}"
-        with Progress("Selecting", len(frames)) as bar:
-            verdicts = select_by_matching(
-                frames, frames.names, OrientationDescriptor(), used, nodes, bar.advance, RepeatFinder().again
+    way = _way(frames, sparse_map, map, config)
+    shown, header = told(str(data), data=data, map=map), [told(line, data=data, map=map) for line in way.header]
+    if resume and output.is_file() and not going_on:
+        _check_finished(output, shown, header)
+    arguments = recorded(source, config, reading, output=output, map=map, with_folder=with_folder, no_frames=no_frames)
+    with kept_beside(output, "select", arguments, overwrite, resume) as run:
+        run.check_inputs(**source.files, map=map)
+        doubts = colours_of(frames).doubts
+        for doubt in doubts:
+            warnings.warn(f"{data}: {doubt}", stacklevel=2)
+        verdicts = _kept(run, way)
+        if not any(v.kept for v in verdicts):
+            raise InputError(
+                data,
+                f"none of the {len(verdicts)} frames is kept ({_counts(verdicts)})",
+                "loosen what rejects them; nothing was written",
             )
-    if not any(v.kept for v in verdicts):
-        raise InputError(
-            data,
-            f"none of the {len(verdicts)} frames is kept ({_counts(verdicts)})",
-            "loosen what rejects them; nothing was written",
-        )
-    summary = f"{sum(v.kept for v in verdicts)} of {len(verdicts)} frames kept; rejected: {_counts(verdicts)}"
-    folder = f"{data.resolve().name}/" if with_folder else ""
-    shown = told(str(data), data=data, map=map)
-    settings = {name: told(v, data=data, map=map) if isinstance(v, str) else v for name, v in settings.items()}
-    how, doubts = told(how, data=data, map=map), tuple(told(doubt, data=data, map=map) for doubt in doubts)
-    header = [
-        f"{shown}: {summary}",
-        how,
-        *(f"{name}: {value}" for name, value in settings.items() if value is not None),
-    ]
-    listed = [f"# {' '.join(line.split())}" for line in header] + [f"{folder}{v.name}" for v in verdicts if v.kept]
-
-    picture = None if no_frames else _sheet(frames, verdicts)
-    page = _page(shown, summary, how, settings, verdicts, picture, doubts)
-    writers: dict[Path, Content] = {
-        paths["table"]: _table(verdicts),
-        paths["page"]: page.write,
-        paths["list"]: "\n".join(listed) + "\n",  # last: its presence means all is there
-    }
-    if picture is not None:
-        writers = {paths["sheet"]: picture, **writers}
-    write_together(writers)
-    if no_frames:
-        paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
+        summary = f"{sum(v.kept for v in verdicts)} of {len(verdicts)} frames kept; rejected: {_counts(verdicts)}"
+        folder = f"{data.resolve().name}/" if with_folder else ""
+        listed = [_comment(line) for line in (f"{shown}: {summary}", *header)]
+        listed += [f"{folder}{v.name}" for v in verdicts if v.kept]
+        picture = None if no_frames else _sheet(frames, verdicts)
+        doubts = tuple(told(doubt, data=data, map=map) for doubt in doubts)
+        writers: dict[Path, Content] = {
+            paths["table"]: _table(verdicts),
+            paths["page"]: _page(f"{shown}, {header[0]}: {summary}.", header[1:], verdicts, picture, doubts).write,
+            paths["list"]: "\n".join(listed) + "\n",  # last: its presence means all is there
+        }
+        if picture is not None:
+            writers = {paths["sheet"]: picture, **writers}
+        write_together(writers)
+        if no_frames:
+            paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
     print(f"{summary}\n{', '.join(str(path) for path in writers)}")
+
+
+@dataclass(frozen=True)
+class _Way:
+    """How frames are chosen: a sentence and a line for each setting, and what gives the verdicts."""
+
+    header: tuple[str, ...]
+    verdicts: Callable[[Run], list[FrameVerdict]]
+
+
+def _way(frames: FrameSequence, sparse_map: SparseMap | None, folder: Path | None, config: SelectConfig) -> _Way:
+    if sparse_map is not None and folder is not None:
+        found, how = _by_map(frames, sparse_map, folder, config.map_rules)
+        return _Way((how, *_lines({"map": str(folder), **asdict(config.map_rules)})), lambda run: found)
+    used: Matcher = SiftMatcher(config.sift) if config.matcher == "sift" else LoftrMatcher(config.loftr)
+    rules = config.sift_nodes if config.matcher == "sift" else config.loftr_nodes
+    own = asdict(config.sift if config.matcher == "sift" else config.loftr)
+    lines = _lines({"matcher": config.matcher, **asdict(rules), **own})
+    return _Way((f"frames matched with {config.matcher}", *lines), lambda run: _by_matching(run, frames, used, rules))
+
+
+def _lines(settings: Mapping[str, object]) -> list[str]:
+    return [f"{name}: {value}" for name, value in settings.items() if value is not None]
+
+
+def _comment(line: str) -> str:
+    return f"# {' '.join(line.split())}"
+
+
+def _check_finished(output: Path, shown: str, header: Sequence[str]) -> None:
+    """Raises AlreadyFinished where the list is of these frames and settings, else InputError."""
+    lines = output.read_text(encoding="utf-8", errors="replace").splitlines()
+    said = [line for line in lines if line.startswith("#")]
+    if said[:1] and said[0].startswith(f"# {shown}: ") and said[1:] == [_comment(line) for line in header]:
+        raise AlreadyFinished(f"{output.name} is already finished")
+    raise InputError(output, "not resumed, it is of other frames or settings", "choose another -o, or --overwrite")
+
+
+def _kept(run: Run, way: _Way) -> list[FrameVerdict]:
+    """The verdicts, or those that were there when the run was stopped as it wrote."""
+    if run.done("verdicts"):
+        return [FrameVerdict(**each) for each in run.kept_of("verdicts")]
+    verdicts = way.verdicts(run)
+    run.finish_part("verdicts", [], [asdict(each) for each in verdicts])
+    return verdicts
+
+
+def _by_matching(run: Run, frames: FrameSequence, matcher: Matcher, rules: NodeRules) -> list[FrameVerdict]:
+    """Verdicts by matching images; what is known of the frames before a node is kept now and then."""
+    before: list[Seen] = []
+    for part in list(run.parts or {}):
+        before += [_seen_again(each) for each in run.kept_of(part)] if run.done(part) else []
+    kept, since = len(before), time.monotonic()
+
+    def keep(seen: Sequence[Seen]) -> None:
+        nonlocal kept, since
+        if time.monotonic() - since >= batches.SECONDS:
+            run.finish_part(f"frames from {kept}", [], [asdict(each) for each in seen[kept:]])
+            kept, since = len(seen), time.monotonic()
+
+    with Progress("Selecting", len(frames)) as bar:
+        describe, again = OrientationDescriptor(), RepeatFinder().again
+        return select_by_matching(frames, frames.names, describe, matcher, rules, bar.advance, again, before, keep)
+
+
+def _seen_again(kept: Mapping[str, Any]) -> Seen:
+    found = Seen(**kept)
+    return replace(found, agreement=None if found.agreement is None else MatchAgreement(*found.agreement))
 
 
 def _paths(output: Path) -> dict[str, Path]:
@@ -210,16 +284,14 @@ def _sheet(frames: FrameSequence, verdicts: Sequence[FrameVerdict]) -> bytes:
 
 
 def _page(
-    data: str,
-    summary: str,
-    how: str,
-    settings: dict[str, object],
+    said: str,
+    settings: Sequence[str],
     verdicts: Sequence[FrameVerdict],
     picture: bytes | None,
     doubts: Sequence[str],
 ) -> Report:
     page = Report("Frames worth training on")
-    page.text(f"{data}, {how}: {summary}.")
+    page.text(said)
     for doubt in doubts:
         page.text(f"Warning: {doubt}.")
     counts = Counter("kept" if v.kept else v.reason for v in verdicts)
@@ -230,5 +302,5 @@ def _page(
         page.heading("Kept (green) and rejected (red)")
         page.wide_figures([(picture, f"At most {_SHOWN} of each, spread over the sequence, in its order")])
     page.heading("Settings")
-    page.table(["", "value"], [[name, str(value)] for name, value in settings.items() if value is not None])
+    page.table(["", "value"], [line.split(": ", 1) for line in settings])
     return page

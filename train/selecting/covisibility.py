@@ -20,6 +20,7 @@ import numpy as np
 
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, frame_number
+from lightdepth.image_quality import RepeatFinder
 from lightdepth.ranges import SHARE, Range, at_least, checked
 from lightdepth.sparse_map import SparseMap, Submap, covisibility
 
@@ -120,8 +121,8 @@ class _Node:
 
 
 @dataclass
-class _Seen:
-    """What is remembered of a frame."""
+class Seen:
+    """What is remembered of a frame: all that the verdicts need."""
 
     name: str
     node: int | None = None
@@ -140,19 +141,24 @@ def select_by_matching(
     rules: NodeRules,
     advance: Callable[[], None] = lambda: None,
     repeated: Callable[[np.ndarray], bool] = lambda image: False,
+    before: Sequence[Seen] = (),
+    at_node: Callable[[Sequence[Seen]], None] = lambda seen: None,
 ) -> list[FrameVerdict]:
     """A verdict for every frame, in order. Each frame is read and described once; images are not kept.
 
     A frame that cannot be read is rejected, and so is one whose image repeats the one before (`repeated`): it
-    matches it, and shows nothing new. Raises InputError when none can be read.
+    matches it, and shows nothing new. `at_node` is told of all frames until then where a node begins with the last of
+    them; a run that is given these as `before` goes on there. Raises InputError when none can be read.
     """
-    seen: list[_Seen] = []
-    views_in: Counter[int] = Counter()
-    node: _Node | None = None
+    seen = list(before)
+    views_in = Counter(s.node for s in seen if s.node is not None and s.view)
+    node = _begun_again(frames, seen, descriptor, matcher, repeated) if seen else None
     trouble = ""
     for i, name in enumerate(names):
         advance()
-        seen.append(_Seen(name))
+        if i < len(before):
+            continue
+        seen.append(Seen(name))
         try:
             frame = frames[i]
         except InputError as error:
@@ -168,6 +174,8 @@ def select_by_matching(
             node = _Node(len(views_in), [i], [(i, described, kept)])
         seen[i].node, seen[i].view = node.id, node.updated == i
         views_in[node.id] = len(node.views)
+        if node.frames[0] == i:
+            at_node(seen)
         if len(node.views) > rules.max_views:
             node = None
     if not views_in:
@@ -181,8 +189,25 @@ def select_by_matching(
     return [_verdict(s, blur, views_in, good) for s, blur in zip(seen, blurred, strict=True)]
 
 
+def _begun_again(
+    frames: Sequence[Frame],
+    seen: Sequence[Seen],
+    descriptor: Descriptor,
+    matcher: Matcher,
+    repeated: Callable[[np.ndarray], bool],
+) -> _Node:
+    """The node that begins with the last of the frames seen; what tells repeats is shown those before it again."""
+    last = len(seen) - 1
+    readable = [i for i, s in enumerate(seen) if s.node is not None or s.double]
+    for i in readable[-RepeatFinder.LOOKS_BACK :]:
+        repeated(frames[i].image)
+    frame, id = frames[last], seen[last].node
+    assert id is not None
+    return _Node(id, [last], [(last, descriptor(frame), matcher.keep(frame))])
+
+
 def _into_node(
-    i: int, described: np.ndarray, kept: Any, node: _Node | None, seen: _Seen, matcher: Matcher, rules: NodeRules
+    i: int, described: np.ndarray, kept: Any, node: _Node | None, seen: Seen, matcher: Matcher, rules: NodeRules
 ) -> _Node | None:
     """The node with frame `i` in it where it belongs there; else as it was."""
     if node is None:
@@ -201,7 +226,7 @@ def _into_node(
     return node
 
 
-def _verdict(seen: _Seen, blurred: bool, views_in: Counter[int], good: set[int]) -> FrameVerdict:
+def _verdict(seen: Seen, blurred: bool, views_in: Counter[int], good: set[int]) -> FrameVerdict:
     matches, spread = seen.agreement or (None, None)
     found = FrameVerdict(
         seen.name,

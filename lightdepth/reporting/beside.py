@@ -1,0 +1,58 @@
+"""Finished parts of a verb that writes single files: they are kept in a hidden folder beside these, and go with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from lightdepth.errors import InputError
+from lightdepth.files.lock import locked
+from lightdepth.files.replacing import check_ours, discard, unfinished_path
+from lightdepth.files.writing import folders_for
+from lightdepth.reporting.run import Run, kept_or_gone
+from lightdepth.reporting.same import check_same
+from lightdepth.reporting.unfinished import begun_with, clean, finished_parts
+
+
+def goes_on(output: Path) -> bool:
+    """Whether a run that was stopped has finished parts for the file `output`."""
+    made = unfinished_path(output.resolve())
+    return begun_with(made) is not None and bool(finished_parts(made))
+
+
+@contextmanager
+def kept_beside(
+    output: Path, verb: str, arguments: Mapping[str, Any], overwrite: bool = False, resume: bool = False
+) -> Iterator[Run]:
+    """A Run whose finished parts are kept beside the file `output` when the block is stopped, until one ends well.
+
+    What it is of is noted with `Run.check_inputs`. Raises InputError when the file is being made by another run, or
+    parts are there and neither `resume` nor `overwrite` is given, or they are of another run.
+    """
+    real = output.resolve()
+    made = unfinished_path(real)
+    with folders_for([made]), locked(real):
+        check_ours(made, output)
+        begun, parts = begun_with(made), finished_parts(made)
+        if begun is not None and parts and not overwrite:
+            if not resume:
+                cure = f"--overwrite starts anew, and {begun['verb']} --resume goes on"
+                raise InputError(output, f"an unfinished run of {begun['verb']} is beside it", cure)
+            check_same(output, begun, verb, arguments)
+        else:
+            parts = {}
+            discard(made)
+            if resume:
+                print("nothing to resume: starting anew", flush=True)
+        run = Run(made, real, verb, arguments, parts)
+        with kept_or_gone(run, real, True), run.hearing():
+            if parts:
+                clean(made, parts)
+                print(f"resumed: {len(parts)} finished part(s) are kept", flush=True)
+            else:
+                made.mkdir(mode=0o700)
+                run.begin()
+            yield run
+        discard(made)
