@@ -18,7 +18,7 @@ from densify.alignment import bent
 from densify.bending import Bend
 from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
-from densify.judging.brake import SHARES, Kept, Tried, kept
+from densify.judging.brake import Kept, Tried, kept
 from densify.judging.columns import Columns, FourWays, Method, hidden_errors, hidden_ratios
 from densify.judging.doubts import Doubts, sigma_at
 from densify.judging.images import Images, Seen
@@ -144,12 +144,11 @@ class Judge:
     def _tried(self, k: AlignedKeyframe) -> Tried:
         bend, alone, told = k.alignment.bend, k.alone, self._told.get(k.keyframe.name)
         assert bend is not None and alone is not None
-        by_images = np.zeros((0, len(SHARES)))
+        by_images = np.zeros((0, 2))
         if told is not None and len(told.deciding):
             o = told.deciding
-            level = np.log(alone.scale)
-            field = level + np.outer(bend.at(o.pixels, o.predicted) - level, SHARES)
-            by_images = field + np.log(o.predicted / o.mapped)[:, None]
+            factors = np.stack([np.full(len(o), np.log(alone.scale)), bend.at(o.pixels, o.predicted)], 1)
+            by_images = factors + np.log(o.predicted / o.mapped)[:, None]
         blocks = np.abs(self._ratios.get(k.keyframe.name, np.zeros((0, 4))) - 1)
         return Tried(by_images, blocks[:, :2], _size(bend))
 

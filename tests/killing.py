@@ -191,6 +191,8 @@ def unlike(made: Path, reference: Path) -> str:
     if not made.is_dir():
         return ""
     one, other = files(made), files(reference)
+    if not (reference / "run.json").is_file():  # what single files are made with lies beside them
+        one, other = ({path for path in every if not path.parts[0].startswith(".")} for every in (one, other))
     for path in sorted(one ^ other):
         return f"{path} is {'one too many' if path in one else 'missing'}"
     for path in sorted(one):
@@ -278,7 +280,7 @@ class Stage:
         elif found := unlike(folder / verb.output, reference / verb.output):
             wrong.append(f"the next run ({' '.join(resumes) or 'as before'}) makes another result: {found}")
         wrong += self._inputs_changed(folder, verb)
-        wrong += [f"{name} is left after the next run" for name in _strays(folder, reference)]
+        wrong += [f"{name} is left after the next run" for name in _strays(folder, reference, verb)]
         if verb.resumes:
             finished, _ = run([*verb.argv, "--resume"], folder)
             if finished.code:
@@ -315,7 +317,7 @@ def _after_the_signal(case: Case, folder: Path, made: Path, older: Path | None, 
         yield f"{verb.output} is there without run.json"
     if not (made / "run.json").is_file() and output.is_dir():  # single files
         for path in sorted(files(output)):
-            if path.name.startswith("."):
+            if path.parts[0].startswith(".") or path.name.startswith("."):
                 continue
             wanted = [made / path] + ([older / path] if older is not None else [])
             if all(not each.is_file() or difference(output / path, each, 0.0) for each in wanted):
@@ -336,9 +338,9 @@ def _after_the_signal(case: Case, folder: Path, made: Path, older: Path | None, 
 
 def _goes_on(folder: Path, verb: Verb) -> bool:
     """Whether a hidden run with a finished part or a checkpoint is there, which --resume has to go on with."""
-    made = folder / f".{verb.output}.unfinished"
-    parts = made / "parts.jsonl"
-    return (parts.is_file() and b"\n" in parts.read_bytes()) or any(made.glob("checkpoints/[!.]*.ckpt"))
+    found = [folder / f".{verb.output}.unfinished", *(folder / verb.output).glob(".*.unfinished")]
+    parts = [made / "parts.jsonl" for made in found if (made / "parts.jsonl").is_file()]
+    return any(b"\n" in path.read_bytes() for path in parts) or any(found[0].glob("checkpoints/[!.]*.ckpt"))
 
 
 def _old_one(folder: Path, verb: Verb, older: Path) -> bool:
@@ -358,8 +360,9 @@ def _holds(folder: Path, result: Path) -> bool:
     return folder.is_dir() and not unlike(folder, result)
 
 
-def _strays(folder: Path, reference: Path) -> list[str]:
-    return sorted({path.name for path in folder.iterdir()} - {path.name for path in reference.iterdir()})
+def _strays(folder: Path, reference: Path, verb: Verb) -> list[str]:
+    beside = {path.name for path in folder.iterdir()} - {path.name for path in reference.iterdir()}
+    return sorted(beside | {f"{verb.output}/{path.name}" for path in (folder / verb.output).glob(".*")})
 
 
 def drawn(verb: Verb, events: list[Event], count: int, draw: Callable[[int], list[int]]) -> list[int]:

@@ -53,8 +53,8 @@ from lightdepth.reporting.run import Run, plain, recorded, run_folder
 
 
 def bench(argv: list[str]) -> int:
-    """The built-in benchmark on synthetic colons; `bench compare A B`; `bench estimators`; `bench per-frame`; `bench
-    completion`."""
+    """The built-in benchmark on synthetic colons; with compare, estimators, per-frame or completion another one."""
+
     of: dict[str, Callable[..., None]] = {
         "compare": compare_runs,
         "estimators": compare_estimators,
@@ -81,8 +81,7 @@ def run(
     overwrite: bool = False,
     resume: bool = False,
 ) -> None:
-    """Synthetic colons made from seeds, judged row by row (--help of bench compare A B, bench estimators, bench
-    per-frame and bench completion says more).
+    """Synthetic colons made from seeds, judged row by row; also compare, estimators, per-frame, completion.
 
     Args:
         output: Folder to make, with bench.json, bench.md, and bench.png (error against coverage and by distance).

@@ -40,7 +40,7 @@ def export(
             or exr of depth; onnx, torch (torch.export) or safetensors of a network.
         size: Width and height, pixels, of the only images that an onnx or torch graph shall take; left out, it takes
             any. A larger one makes the network slower.
-        half: Store the weights of safetensors in half precision, as checkpoints are kept; no-half keeps all digits.
+        half: Store the weights of safetensors in half precision, as checkpoints are kept; false keeps all digits.
         step: Depth of one code of a 16-bit png, in mm or the unit that the predictions have; left out, a power of ten
             that the farthest fits. A larger one holds farther depth, less finely.
         overwrite: Replace a folder made before.

@@ -1,18 +1,18 @@
 """How much of its bend each keyframe keeps: as much as distances speak for that it was not fitted to.
 
 A bend follows the points of the map, and these may err together: a side of the wall that is too far bends every
-keyframe that sees it. So all of the bend, half of it and none (one scale) are held against distances by parallax. With
-L_s the mean squared error in log distance with a share s of the bend, errors cut at 40 %, over the n distances of a
-keyframe, and M_s that over all of its submap,
+keyframe that sees it. So the bend is held against distances by parallax. With f what it adds in log distance to one
+scale, and r what the images say should be added, the share s of the bends that a submap needs is the slope of
 
-    loss_s = (n L_s + m M_s) / (n + m),
+    r = s f + noise,
 
-m distances of the submap standing in for what a keyframe with few of its own does not know. The keyframe keeps the
-least share whose loss is within one standard error of the least loss: where the images can hardly tell, less is bent.
+by iterated reweighting. Its variance counts a distance for a quarter, as neighbours share their errors; before any is
+seen s is expected to be 1, give or take .5. A keyframe's own share is expected to be its submap's, give or take .1.
+Where s is below .3 the bend is undone, as what is left of it is wrong as likely as right; from .85 on all of it stays.
 
-Where the images are silent, blocks of wall that were hidden from the bend decide, by the same losses, between all of it
-and none. It must then be better by some, and no larger than its prior lets expect, since blocks beside the hidden ones
-may share their error.
+Where the images are silent, or leave s as unsure as it was, blocks of wall that were hidden from the bend decide
+between all of it and none. It must then be better by some, and no larger than its prior lets expect, since blocks
+beside the hidden ones may share their error.
 """
 
 from __future__ import annotations
@@ -22,18 +22,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SHARES = (0.0, 0.5, 1.0)
-"""Shares of a bend that are tried."""
+from lightdepth.robust import mad_sigma, robust_weights
+
+_NEIGHBOURS = 4.0
+_USUAL, _SPREAD, _APART = 1.0, 0.5, 0.1
+_NONE_BELOW, _ALL_FROM = 0.3, 0.85
 _CUT = 0.4
 _BORROWED = 100.0
 _LEAST = 40
+_WIDTH, _LEAST_SIGMA = 2.0, 0.01
 _GAIN_BY_MAP = 0.95
 _LARGEST = 2.0
 
 
 @dataclass(frozen=True)
 class Tried:
-    """One keyframe's bend: errors in log distance (n, 3) with each of SHARES by the images, errors as shares (m, 2)
+    """One keyframe's bend: errors in log distance (n, 2) by the images with none and all of it, errors as shares (m, 2)
     with none and all of it at hidden blocks, and the size of the bend in deviations of its prior (1 is usual)."""
 
     by_images: np.ndarray
@@ -51,26 +55,55 @@ class Kept:
 
 def kept(tried: Mapping[str, Tried]) -> dict[str, Kept]:
     """What each keyframe keeps of its bend, by name."""
-    images = {name: _squared(t.by_images) for name, t in tried.items()}
+    images = {name: t.by_images[np.isfinite(t.by_images).all(1)] for name, t in tried.items()}
     if sum(map(len, images.values())) >= _LEAST:
-        return _least_within_error(images)
+        own = _slope(np.concatenate(list(images.values())), _USUAL)
+        if own.variance < _SPREAD**2:
+            level = own.seen_from(_Share(_USUAL, _SPREAD**2))
+            return {name: _by_images(errors, level) for name, errors in images.items()}
     blocks = {name: _squared(t.by_map) for name, t in tried.items()}
     if not sum(map(len, blocks.values())):
         return dict.fromkeys(tried, Kept(0.0, "nothing that it was not fitted to can judge the bend"))
     return {name: _by_blocks(losses[0], losses[1], tried[name].size) for name, losses in _losses(blocks).items()}
 
 
-def _least_within_error(squared: Mapping[str, np.ndarray]) -> dict[str, Kept]:
-    every = np.concatenate(list(squared.values()))
-    found = {}
-    for name, losses in _losses(squared).items():
-        best = int(losses.argmin())
-        error = (every - every[:, [best]]).std(0) / np.sqrt(len(squared[name]) + _BORROWED)
-        least = int(np.flatnonzero(losses - losses[best] <= error)[0])
-        share, whole = SHARES[least], SHARES.index(1.0)
-        why = f"by the images {_shown(losses[least])} are left with {_part(share)}, {_shown(losses[whole])} with all"
-        found[name] = Kept(share, "" if least == whole else why)
-    return found
+@dataclass(frozen=True)
+class _Share:
+    """A share of a bend, and the variance of what is known of it."""
+
+    value: float
+    variance: float
+
+    def seen_from(self, before: _Share) -> _Share:
+        """With what was known before."""
+        weights = 1 / self.variance, 1 / before.variance
+        value = (weights[0] * self.value + weights[1] * before.value) / sum(weights)
+        return _Share(value, 1 / sum(weights))
+
+
+def _slope(errors: np.ndarray, value: float) -> _Share:
+    """The share that errors (n, 2) with none and all of a bend speak for; begun at `value`."""
+    wanted, added = -errors[:, 0], errors[:, 1] - errors[:, 0]
+    variance = np.inf
+    for _ in range(10):
+        left = wanted - value * added
+        weight = robust_weights(left / mad_sigma(left, _LEAST_SIGMA) / _WIDTH) if len(left) else left
+        told = float((weight * added**2).sum())
+        if told < 1e-9:
+            return _Share(value, np.inf)
+        value = float((weight * added * wanted).sum()) / told
+        variance = _NEIGHBOURS * float(((weight * left * added) ** 2).sum()) / told**2
+    return _Share(value, max(variance, 1e-6))
+
+
+def _by_images(errors: np.ndarray, level: _Share) -> Kept:
+    expected = _Share(level.value, level.variance + _APART**2)
+    found = _slope(errors, level.value).seen_from(expected).value
+    share = 0.0 if found < _NONE_BELOW else 1.0 if found >= _ALL_FROM else round(found, 1)
+    if share == 1:
+        return Kept(1.0)
+    wrong = f"the images speak for {max(found, 0):.0%} of the bend to the map's points"
+    return Kept(share, wrong if share else f"{wrong}, too little to tell it from none")
 
 
 def _by_blocks(none: float, every: float, size: float) -> Kept:
@@ -90,10 +123,6 @@ def _losses(squared: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _squared(errors: np.ndarray) -> np.ndarray:
     result: np.ndarray = np.minimum(errors[np.isfinite(errors).all(1)] ** 2, _CUT**2)
     return result
-
-
-def _part(share: float) -> str:
-    return "one scale" if share == 0 else f"{share:.0%} of the bend"
 
 
 def _shown(loss: float) -> str:

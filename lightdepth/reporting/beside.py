@@ -44,7 +44,7 @@ def kept_beside(
         else:
             parts = {}
             discard(made)
-            if resume:
+            if resume and not output.exists():
                 print("nothing to resume: starting anew", flush=True)
         run = Run(made, real, verb, arguments, parts)
         with kept_or_gone(run, real, True), run.hearing():

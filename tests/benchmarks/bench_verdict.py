@@ -13,6 +13,7 @@ stood, the trajectories brought together by a similarity, and e_1 that of the sa
 RMS is that of the rays that all meet, or the one that sees less would win. Drift of scale stands apart: no image can
 see it. What `densify` says of frames and map before it begins is there too: where it refuses, the verdict is what a
 user gets who says --trust-map, and a pairing that is wrong or doubtful is never green.
+
 LIGHTDEPTH_VERDICT=docs/verdict.md writes the tables there; LIGHTDEPTH_SCENES takes other colons, in sixes, as "710
 711 712 713 714 715", to tune on.
 """
@@ -249,19 +250,21 @@ def test_the_verdict_and_the_number_order_runs_as_truth_does():
     worse = [r.rms[0] / r.rms[1] for r in coherent]
     before = [r.rms[2] / r.rms[1] for r in coherent]
     begun = [r for r in rows if r.pairing != "wrong"]
-    red, green = ([r for r in rows if r.truth == c] for c in ("red", "green"))
+    red, amber, green = ([r for r in rows if r.truth == c] for c in ("red", "amber", "green"))
     said = [
         f"Rank correlation of the own number with the true error: {correlation(rows):.2f} over all, "
         f"{correlation(coherent):.2f} within those that err together; {correlation(begun):.2f} over the {len(begun)} "
         f"whose frames and map are not refused.",
-        f"Amber: {sum(r.colour == 'amber' for r in rows)} of 40. Red called green: "
-        f"{sum(r.colour == 'green' for r in red)} of {len(red)}. Green called red: "
+        f"Called amber: {sum(r.colour == 'amber' for r in rows)} of 40. Red called green: "
+        f"{sum(r.colour == 'green' for r in red)} of {len(red)}. Amber called green: "
+        f"{sum(r.colour == 'green' for r in amber)} of {len(amber)}. Green called red: "
         f"{sum(r.colour == 'red' for r in green)} of {len(green)}.",
         f"Full at most 1.05 of one scale's RMS where errors come together: {sum(w <= 1.05 for w in worse)} of "
         f"{len(worse)} (without the brake {sum(b <= 1.05 for b in before)}); "
         f"worst {max(worse):.2f} ({max(before):.2f}).",
     ]
-    page = ["# The verdict against truth", "", (__doc__ or "").split("\n\n")[2].strip(), "", *(f"{s}\n" for s in said)]
+    rules = "\n\n".join((__doc__ or "").split("\n\n")[2:5])
+    page = ["# The verdict against truth", "", rules, "", *(f"{s}\n" for s in said)]
     page += [*table(rows), "", "Drift of scale, which no image can see:", "", *table(apart)]
     print("\n".join(page))
     if "LIGHTDEPTH_VERDICT" in os.environ:

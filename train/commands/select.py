@@ -132,10 +132,10 @@ def select(
     frames = frames.without_truth()
     way = _way(frames, sparse_map, map, config)
     shown, header = told(str(data), data=data, map=map), [told(line, data=data, map=map) for line in way.header]
-    if resume and output.is_file() and not going_on:
-        _check_finished(output, shown, header)
     arguments = recorded(source, config, reading, output=output, map=map, with_folder=with_folder, no_frames=no_frames)
     with kept_beside(output, "select", arguments, overwrite, resume) as run:
+        if resume and not run.resumed and output.is_file():
+            _check_finished(output, shown, header)
         run.check_inputs(**source.files, map=map)
         doubts = colours_of(frames).doubts
         for doubt in doubts:
