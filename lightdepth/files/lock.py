@@ -36,8 +36,7 @@ def locked(output: Path) -> Iterator[None]:
     try:
         with finishing_first():
             descriptor = _opened(path, output)
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
+            _write(descriptor, path)
         yield
     finally:
         if descriptor is not None:
@@ -144,6 +143,15 @@ def _lives(holder: dict[str, Any]) -> bool:
     except (OSError, KeyError, TypeError, ValueError, OverflowError):
         return False
     return True
+
+
+def _write(descriptor: int, path: Path) -> None:
+    try:
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
+    except OSError as error:
+        error.filename = str(path)  # a descriptor tells nobody which disk is full
+        raise
 
 
 def _read(descriptor: int) -> dict[str, Any]:

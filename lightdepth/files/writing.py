@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lightdepth.errors import InputError
-from lightdepth.files.machine import FAILS
+from lightdepth.files.machine import FAILS, check_room
 from lightdepth.signals import finishing_first
 
 Content = str | bytes | Callable[[Path], object]
@@ -207,4 +207,10 @@ def _write(path: Path, content: Content) -> None:
     elif isinstance(content, bytes):
         path.write_bytes(content)
     else:
-        content(path)
+        try:
+            content(path)
+        except (OSError, InputError):
+            raise
+        except Exception:
+            check_room(path)
+            raise
