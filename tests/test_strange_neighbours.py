@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from raising import refused
 
+from lightdepth.errors import AlreadyFinished
 from lightdepth.files.lock import is_live, lock_path
 from lightdepth.files.replacing import BEGUN, PARTS, RECORD, old_path, read_record, remains, unfinished_path
 from lightdepth.reporting.run import run_folder
@@ -65,6 +66,16 @@ def test_a_link_in_the_place_of_a_hidden_folder_costs_nothing_where_it_leads(tmp
         with refused("in the way", "not made by this program"):
             make(tmp_path / "out", **given)
     assert sorted((tmp_path / "elsewhere").rglob("*")) == before and not list(remains(tmp_path))
+
+
+@pytest.mark.parametrize("change", [os.unlink, lambda path: path.write_text(""), lambda path: path.write_text("newer")])
+def test_a_finished_run_that_lost_a_file_or_has_another_one_is_not_called_finished(tmp_path, change):
+    make(tmp_path / "out")
+    with pytest.raises(AlreadyFinished):
+        make(tmp_path / "out", resume=True)
+    change(tmp_path / "out" / "result.txt")
+    with refused("result.txt of it", where="out", found="not resumed"):
+        make(tmp_path / "out", resume=True)
 
 
 def test_an_unfinished_run_with_a_link_in_it_is_begun_anew_and_nothing_is_written_where_it_leads(tmp_path):
