@@ -68,6 +68,48 @@ def test_a_link_in_the_place_of_a_hidden_folder_costs_nothing_where_it_leads(tmp
     assert sorted((tmp_path / "elsewhere").rglob("*")) == before and not list(remains(tmp_path))
 
 
+@pytest.mark.parametrize("place", ["", "maps"])
+def test_a_result_that_is_write_protected_is_not_overwritten(tmp_path, monkeypatch, place):
+    with run_folder(tmp_path / "out", "densify", {"seed": 3}) as run:
+        (run.folder / "maps").mkdir()
+        (run.folder / "maps" / "one.txt").write_text("one")
+    asked = os.access  # root may change whatever is protected
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path / "out" / place and asked(path, mode))
+    with refused("protected", cure="another -o"):
+        make(tmp_path / "out", overwrite=True)
+    assert (tmp_path / "out" / "maps" / "one.txt").read_text() == "one" and os.listdir(tmp_path) == ["out"]
+
+
+def test_an_old_result_that_cannot_be_removed_stands_in_nobody_s_way(tmp_path, monkeypatch):
+    make(tmp_path / "out")
+    protected, unlink = (tmp_path / "out" / "result.txt").stat().st_ino, Path.unlink
+
+    def unlinked(path, missing_ok=False):
+        if path.exists() and path.stat().st_ino == protected:
+            raise PermissionError(13, "Permission denied", str(path))
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", unlinked)
+    for _ in range(2):
+        make(tmp_path / "out", overwrite=True)
+    assert sorted(os.listdir(tmp_path)) == ["out", "out.1"] and (tmp_path / "out.1" / "result.txt").is_file()
+
+
+def test_an_input_is_found_in_an_output_under_another_name_of_the_same_folder(tmp_path, monkeypatch):
+    make(tmp_path / "out")
+    (tmp_path / "mounted").mkdir()
+    (tmp_path / "mounted" / "camera.json").write_text("{}")
+    real = Path.stat
+
+    def stat_as_mounted(path, **given):
+        return real(tmp_path / "out" if path == tmp_path / "mounted" else path, **given)
+
+    monkeypatch.setattr(Path, "stat", stat_as_mounted)
+    for inside in ("mounted", "mounted/camera.json"):
+        with refused("is read from it"):
+            make(tmp_path / "out", {"data": str(tmp_path / inside)}, overwrite=True)
+
+
 @pytest.mark.parametrize("change", [os.unlink, lambda path: path.write_text(""), lambda path: path.write_text("newer")])
 def test_a_finished_run_that_lost_a_file_or_has_another_one_is_not_called_finished(tmp_path, change):
     make(tmp_path / "out")

@@ -35,8 +35,7 @@ def locked(output: Path) -> Iterator[None]:
     path, descriptor = lock_path(output), None
     try:
         with finishing_first():
-            descriptor = _opened(path, output)
-            _write(descriptor, path)
+            descriptor = _held(path, output)
         yield
     finally:
         if descriptor is not None:
@@ -78,6 +77,22 @@ def is_lock(path: Path) -> bool:
         return set(_read(descriptor)) >= _LOCK
     finally:
         os.close(descriptor)
+
+
+def _held(path: Path, output: Path) -> int:
+    """The lock file, held, with what we say in it. An OSError names the output: the user does not know of the lock."""
+    descriptor = None
+    try:
+        descriptor = _opened(path, output)
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
+    except OSError as error:
+        if descriptor is not None:
+            path.unlink(missing_ok=True)
+            os.close(descriptor)
+        error.filename = str(output)
+        raise
+    return descriptor
 
 
 def _opened(path: Path, output: Path) -> int:
@@ -143,15 +158,6 @@ def _lives(holder: dict[str, Any]) -> bool:
     except (OSError, KeyError, TypeError, ValueError, OverflowError):
         return False
     return True
-
-
-def _write(descriptor: int, path: Path) -> None:
-    try:
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
-    except OSError as error:
-        error.filename = str(path)  # a descriptor tells nobody which disk is full
-        raise
 
 
 def _read(descriptor: int) -> dict[str, Any]:

@@ -105,6 +105,7 @@ def check_writable(path: Path) -> None:
                 _remove(probe)
     except OSError as error:
         if error.errno in FAILS:
+            error.filename = os.fspath(path)
             raise
         raise InputError(path, f"cannot be written ({error.strerror or error})", "choose another place") from error
 
