@@ -39,6 +39,13 @@ def test_a_link_in_the_place_of_the_lock_is_not_written_through(tmp_path):
     assert (tmp_path / "thesis.txt").read_text() == "mine" and lock_path(tmp_path / "out").is_symlink()
 
 
+def test_a_folder_with_the_name_of_a_lock_is_named(tmp_path):
+    lock_path(tmp_path / "out").mkdir()
+    with refused(".out.lock", "in the way", cure="another -o"):
+        make(tmp_path / "out")
+    assert os.listdir(tmp_path) == [".out.lock"]
+
+
 @pytest.mark.parametrize("text", ["mine", "[1]", '{"host": "here"}'])
 def test_a_file_of_another_program_with_the_name_of_a_lock_is_left_alone(tmp_path, text):
     lock_path(tmp_path / "out").write_text(text)

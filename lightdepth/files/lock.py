@@ -101,7 +101,7 @@ def _opened(path: Path, output: Path) -> int:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | _AS_IT_IS, 0o644)
         except OSError as error:
-            if error.errno != errno.ELOOP:
+            if error.errno not in (errno.ELOOP, errno.EISDIR):
                 raise
             raise _in_the_way(path, output) from error  # a link: what it leads to would be written over
         try:
