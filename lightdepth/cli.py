@@ -214,7 +214,7 @@ def verb_parser(function: Any, verb: str) -> Parser:
         parser.add_argument(
             "-o",
             "--output",
-            type=Path | None,
+            type=Path if needed else Path | None,  # a folder may be called null
             required=needed,
             default=None if needed else default,
             help=said.get("output"),

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from densify.evaluation.depth_files import DepthReading
-from lightdepth.cli import main
+from lightdepth.cli import main, parse
 from lightdepth.command_line.warned import warnings_as_sentences
+from lightdepth.commands.predict import predict
 from lightdepth.foreign_text import for_table, for_terminal, from_table
-from lightdepth.reporting.run import run_folder
+from lightdepth.reporting.run import paths_in, run_folder
 
 EVIL = "\x1b]0;mine\x07\x1b[31m\x9b2J\rgone\u202e"
 
@@ -66,3 +67,9 @@ def test_every_text_is_read_back_from_a_table_as_it_was(text):
 @pytest.mark.parametrize("text", ["", "-0.5", "+3", "-1e-9", "000012", "colon", "a=b", "'quoted'"])
 def test_numbers_and_usual_names_stand_in_a_table_as_they_are(text):
     assert for_table(text) == text == from_table(text)
+
+
+@pytest.mark.parametrize("name", ["null", "~", "#case", "&x", "2024-01-01", "1e3", "[a]", "{a: b}"])
+def test_a_folder_may_be_called_whatever_yaml_takes_for_something_else(name):
+    found = parse(predict, "predict", [name, "-o", name])
+    assert found["output"] == Path(name) and Path(name) in paths_in(found["source"])
