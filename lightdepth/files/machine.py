@@ -33,9 +33,6 @@ _FULL = 1 << 16
 """A disk with less room than this, in bytes, when a writer failed: then that is why. Libraries do not always say, but
 what they wrote of their file has filled the disk."""
 
-_MORE = bytes(1 << 16)
-"""What a file is asked to take where a library that wrote it failed for a reason of its own."""
-
 _MEMORY = ("can't allocate memory", "out of memory", "Insufficient memory", "Cannot allocate memory", "bad_alloc")
 
 
@@ -57,19 +54,6 @@ def machine_failure(
     inside = folder is not None and where.is_relative_to(folder)
     said = f"{place if inside and place else where}: {reason}{_room(where)}"
     return MachineFailure(". ".join(filter(None, (said, kept))))
-
-
-def check_room(file: Path) -> None:
-    """Raises the system's OSError where it does not let a file grow: for libraries that only say that they failed. The
-    file is longer afterwards."""
-    try:
-        with file.open("ab") as end:
-            end.write(_MORE)
-            end.flush()
-            os.fsync(end.fileno())
-    except OSError as error:
-        if error.errno in FAILS:
-            raise
 
 
 def is_lost() -> bool:

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lightdepth.errors import InputError
-from lightdepth.files.machine import FAILS, check_room
+from lightdepth.files.machine import FAILS
 from lightdepth.signals import finishing_first
 
 Content = str | bytes | Callable[[Path], object]
@@ -32,6 +32,9 @@ _LONGEST = 255
 """What file systems take as a name, in bytes."""
 _BEFORE = len(PARTIAL) + 8 + 1 + 9 + 1
 """Bytes that stand before the real name at the most, whatever number the process has: killed runs had others."""
+
+_MORE = bytes(1 << 16)
+"""What a file is asked to take where a library that wrote it failed for a reason of its own."""
 
 _NOT_HERE = (errno.EINVAL, errno.ENOTSUP)
 """Some file systems cannot bring a folder to the disk, and say so; a finished run is not lost over it."""
@@ -213,5 +216,18 @@ def _write(path: Path, content: Content) -> None:
         except (OSError, InputError):
             raise
         except Exception:
-            check_room(path)
+            _check_room(path)
+            raise
+
+
+def _check_room(file: Path) -> None:
+    """Raises the system's OSError where it does not let a file grow: for libraries that only say that they failed. The
+    file is longer afterwards."""
+    try:
+        with file.open("ab") as end:
+            end.write(_MORE)
+            end.flush()
+            os.fsync(end.fileno())
+    except OSError as error:
+        if error.errno in FAILS:
             raise
