@@ -24,6 +24,7 @@ from lightdepth.files.named_inputs import with_real_inputs
 from lightdepth.files.reading import reading
 from lightdepth.files.schema import read_json
 from lightdepth.files.tum import read_tum, write_tum
+from lightdepth.foreign_text import for_table
 from lightdepth.sparse_map import Keyframe, Submap
 
 GREEN, RED, GREY = (0, 170, 60), (220, 30, 30), (150, 150, 150)
@@ -203,11 +204,17 @@ class DenseMap(Brief):
             columns = ["keyframe", "frame", "ok", "scale", "sigma", "points", "inliers", "inlier_share"]
             table.writerow([*columns, *Contribution.__dataclass_fields__, "reason"])
             for keyframe, a in zip(self.submap.keyframes, self.alignments, strict=True):
-                row = [a.keyframe, keyframe.number, int(a.ok), f"{a.scale * scale:.9g}", f"{a.sigma * scale:.6g}"]
+                row = [
+                    for_table(a.keyframe),
+                    keyframe.number,
+                    int(a.ok),
+                    f"{a.scale * scale:.9g}",
+                    f"{a.sigma * scale:.6g}",
+                ]
                 row += [a.points, len(a.inlier_ids), f"{a.inlier_share:.4f}"]
                 found = self.contributions.get(a.keyframe)
                 row += [f"{value:.4f}" for value in astuple(found)] if found else [""] * len(fields(Contribution))
-                table.writerow([*row, a.reason])
+                table.writerow([*row, for_table(a.reason)])
 
 
 def write_origin(folder: Path, submap: Submap, scale: float) -> None:

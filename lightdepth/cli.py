@@ -36,6 +36,7 @@ from lightdepth.errors import (
     MissingOption,
     PartialFailure,
 )
+from lightdepth.foreign_text import for_terminal
 from lightdepth.signals import ending_on_signals
 
 GROUP = "lightdepth.commands"
@@ -82,11 +83,11 @@ def main(argv: list[str] | None = None) -> int:
         return code
     except Interrupted as error:
         with suppress(OSError):  # the terminal may be what is gone
-            print(f"lightdepth {given[0] if given else ''}: {error}", file=sys.stderr, flush=True)
+            _say(f"lightdepth {given[0] if given else ''}: {error}", flush=True)
         return 128 + error.signal
     except MachineFailure as error:  # of the terminal itself: what was to be said could not be
         with suppress(OSError):
-            print(f"lightdepth {given[0] if given else ''}: {error}", file=sys.stderr, flush=True)
+            _say(f"lightdepth {given[0] if given else ''}: {error}", flush=True)
         return code or 5
 
 
@@ -94,7 +95,7 @@ def _main(argv: list[str]) -> int:
     try:
         own_packages_first()
     except InputError as error:
-        print(f"lightdepth: {error}", file=sys.stderr)
+        _say(f"lightdepth: {error}")
         return 3
     commands = {entry.name: entry for entry in metadata.entry_points(group=GROUP)}
     if not argv or argv[0] in ("-h", "--help", "--help-all"):
@@ -109,12 +110,9 @@ def _main(argv: list[str]) -> int:
 
         close = difflib.get_close_matches(verb, commands, 1)
         hint = f"; did you mean {close[0]}?" if close else f"; expected one of {', '.join(_sorted(commands))}"
-        print(f"lightdepth: no verb {verb!r}{hint}", file=sys.stderr)
+        _say(f"lightdepth: no verb {verb!r}{hint}")
         return 2
-    try:
-        os.getcwd()
-    except OSError:  # libraries of the verbs would crash on it
-        print(f"lightdepth {verb}: the folder that you are in is gone; go to another one", file=sys.stderr)
+    if _is_lost(verb):  # libraries of the verbs would crash on it
         return 5
     try:
         function = commands[verb].load()
@@ -122,16 +120,18 @@ def _main(argv: list[str]) -> int:
             return function(rest) or 0
         return function(**parse(function, verb, rest)) or 0
     except MissingOption as error:
-        print(f"lightdepth {verb}: {error}", file=sys.stderr)
+        _say(f"lightdepth {verb}: {error}")
         return 2
     except InputError as error:
-        print(f"lightdepth {verb}: {error}", file=sys.stderr)
+        if _is_lost(verb):
+            return 5
+        _say(f"lightdepth {verb}: {error}")
         return 3
     except PartialFailure as error:
-        print(f"lightdepth {verb}: {error}", file=sys.stderr)
+        _say(f"lightdepth {verb}: {error}")
         return 4
     except AlreadyFinished as error:
-        print(f"lightdepth {verb}: {error}")
+        print(for_terminal(f"lightdepth {verb}: {error}"))
         return 0
     except (MachineFailure, OSError, MemoryError, RuntimeError) as error:
         return _failed(verb, error)
@@ -139,11 +139,25 @@ def _main(argv: list[str]) -> int:
         if not any("\udc80" <= letter <= "\udcff" for letter in str(error.object)):
             raise
         name = str(error.object).encode("utf-8", "backslashreplace").decode()
-        print(f"lightdepth {verb}: {name[:300]}: a name that is not UTF-8; rename it", file=sys.stderr)
+        _say(f"lightdepth {verb}: {name[:300]}: a name that is not UTF-8; rename it")
         return 3
     except KeyboardInterrupt:  # where signals are not ours: outside the main thread
-        print(f"lightdepth {verb}: interrupted", file=sys.stderr)
+        _say(f"lightdepth {verb}: interrupted")
         return 130
+
+
+def _say(line: str, flush: bool = False) -> None:
+    """A line on standard error; names in it do nothing to the terminal."""
+    print(for_terminal(line), file=sys.stderr, flush=flush)
+
+
+def _is_lost(verb: str) -> bool:
+    """Whether the folder that the user is in is gone, which is told then."""
+    from lightdepth.files.machine import is_lost
+
+    if lost := is_lost():
+        _say(f"lightdepth {verb}: the folder that you are in is gone; go to another one")
+    return lost
 
 
 def _failed(verb: str, error: Exception) -> int:
@@ -152,11 +166,11 @@ def _failed(verb: str, error: Exception) -> int:
 
     failure = error if isinstance(error, MachineFailure) else machine_failure(error)
     if failure is not None:
-        print(f"lightdepth {verb}: {failure}", file=sys.stderr)
+        _say(f"lightdepth {verb}: {failure}")
         return 5
     if not isinstance(error, OSError) or error.filename is None or isinstance(error.filename, int):
         raise error
-    print(f"lightdepth {verb}: {os.fsdecode(error.filename)}: {error.strerror or error}", file=sys.stderr)
+    _say(f"lightdepth {verb}: {os.fsdecode(error.filename)}: {error.strerror or error}")
     return 3
 
 
@@ -205,7 +219,7 @@ def verb_parser(function: Any, verb: str) -> Parser:
         parser.add_argument(
             "-o",
             "--output",
-            type=Path | None,
+            type=Path if needed else Path | None,  # a folder may be called null
             required=needed,
             default=None if needed else default,
             help=said.get("output"),

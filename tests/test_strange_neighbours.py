@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from raising import refused
 
+from lightdepth.errors import AlreadyFinished
 from lightdepth.files.lock import is_live, lock_path
 from lightdepth.files.replacing import BEGUN, PARTS, RECORD, old_path, read_record, remains, unfinished_path
 from lightdepth.reporting.run import run_folder
@@ -36,6 +37,13 @@ def test_a_link_in_the_place_of_the_lock_is_not_written_through(tmp_path):
     with refused("in the way", "not made by this program", cure="another -o"):
         make(tmp_path / "out")
     assert (tmp_path / "thesis.txt").read_text() == "mine" and lock_path(tmp_path / "out").is_symlink()
+
+
+def test_a_folder_with_the_name_of_a_lock_is_named(tmp_path):
+    lock_path(tmp_path / "out").mkdir()
+    with refused(".out.lock", "in the way", cure="another -o"):
+        make(tmp_path / "out")
+    assert os.listdir(tmp_path) == [".out.lock"]
 
 
 @pytest.mark.parametrize("text", ["mine", "[1]", '{"host": "here"}'])
@@ -65,6 +73,58 @@ def test_a_link_in_the_place_of_a_hidden_folder_costs_nothing_where_it_leads(tmp
         with refused("in the way", "not made by this program"):
             make(tmp_path / "out", **given)
     assert sorted((tmp_path / "elsewhere").rglob("*")) == before and not list(remains(tmp_path))
+
+
+@pytest.mark.parametrize("place", ["", "maps"])
+def test_a_result_that_is_write_protected_is_not_overwritten(tmp_path, monkeypatch, place):
+    with run_folder(tmp_path / "out", "densify", {"seed": 3}) as run:
+        (run.folder / "maps").mkdir()
+        (run.folder / "maps" / "one.txt").write_text("one")
+    asked = os.access  # root may change whatever is protected
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path / "out" / place and asked(path, mode))
+    with refused("protected", cure="another -o"):
+        make(tmp_path / "out", overwrite=True)
+    assert (tmp_path / "out" / "maps" / "one.txt").read_text() == "one" and os.listdir(tmp_path) == ["out"]
+
+
+def test_an_old_result_that_cannot_be_removed_stands_in_nobody_s_way(tmp_path, monkeypatch):
+    make(tmp_path / "out")
+    protected, unlink = (tmp_path / "out" / "result.txt").stat().st_ino, Path.unlink
+
+    def unlinked(path, missing_ok=False):
+        if path.exists() and path.stat().st_ino == protected:
+            raise PermissionError(13, "Permission denied", str(path))
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", unlinked)
+    for _ in range(2):
+        make(tmp_path / "out", overwrite=True)
+    assert sorted(os.listdir(tmp_path)) == ["out", "out.1"] and (tmp_path / "out.1" / "result.txt").is_file()
+
+
+def test_an_input_is_found_in_an_output_under_another_name_of_the_same_folder(tmp_path, monkeypatch):
+    make(tmp_path / "out")
+    (tmp_path / "mounted").mkdir()
+    (tmp_path / "mounted" / "camera.json").write_text("{}")
+    real = Path.stat
+
+    def stat_as_mounted(path, **given):
+        return real(tmp_path / "out" if path == tmp_path / "mounted" else path, **given)
+
+    monkeypatch.setattr(Path, "stat", stat_as_mounted)
+    for inside in ("mounted", "mounted/camera.json"):
+        with refused("is read from it"):
+            make(tmp_path / "out", {"data": str(tmp_path / inside)}, overwrite=True)
+
+
+@pytest.mark.parametrize("change", [os.unlink, lambda path: path.write_text(""), lambda path: path.write_text("newer")])
+def test_a_finished_run_that_lost_a_file_or_has_another_one_is_not_called_finished(tmp_path, change):
+    make(tmp_path / "out")
+    with pytest.raises(AlreadyFinished):
+        make(tmp_path / "out", resume=True)
+    change(tmp_path / "out" / "result.txt")
+    with refused("result.txt of it", where="out", found="not resumed"):
+        make(tmp_path / "out", resume=True)
 
 
 def test_an_unfinished_run_with_a_link_in_it_is_begun_anew_and_nothing_is_written_where_it_leads(tmp_path):

@@ -13,7 +13,7 @@ from colons import colon
 from lightning.pytorch import Callback, seed_everything
 from raising import refused, warned
 from scenes import cylinder
-from training import CAMERA, LIGHT, batch_of, write_sequence
+from training import CAMERA, LIGHT, TINY_RUN, batch_of, write_sequence
 
 import train.fit as fit_module
 from lightdepth.checkpoint import load_model, read_card
@@ -31,10 +31,6 @@ from train.callbacks import validation_line
 from train.commands.train import train
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs" / "train").glob("*.yaml"))
-TINY_RUN = [
-    *["--data.size", "[40, 32]", "--data.tube.scenes", "2", "--data.tube.val_scenes", "1", "--data.tube.frames", "4"],
-    *["--model.network.width", "4", "--trainer.accelerator", "cpu", "--trainer.val_check_interval", "10"],
-]
 
 
 def test_training_steps_lower_the_loss():

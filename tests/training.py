@@ -14,6 +14,10 @@ from train.datamodule import collate
 
 LIGHT = PhotometricCalibration(gain=100.0, position_mm=(1.0, 2.0, 0.5), direction=(0.1, -0.05, 1.0))
 CAMERA = Pinhole(40, 32, 22.0, 22.0, 18.0, 17.0)
+TINY_RUN = [
+    *["--data.size", "[40, 32]", "--data.tube.scenes", "2", "--data.tube.val_scenes", "1", "--data.tube.frames", "4"],
+    *["--model.network.width", "4", "--trainer.accelerator", "cpu", "--trainer.val_check_interval", "10"],
+]
 
 
 def batch_of(count: int = 2):

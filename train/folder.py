@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lightning.pytorch.utilities import rank_zero_only
 
 from lightdepth.errors import InputError
 from lightdepth.files.lock import locked
+from lightdepth.files.machine import machine_failure
 from lightdepth.files.named_inputs import INPUTS
 from lightdepth.files.replacing import (
     BEGUN,
@@ -61,8 +62,8 @@ def check_output(output: Path, resume: bool, overwrite: bool, inputs: Iterable[P
     if not resume and not overwrite and (complete or has_checkpoint(output) or hidden):
         state = "complete" if complete and not hidden else "unfinished"
         raise InputError(output, f"holds a {state} run", "--resume continues it, --overwrite starts anew")
-    if resume and complete and (record := read_record(output)) is not None and record["verb"] != "train":
-        raise InputError(output, f"not resumed, it is of {record['verb']}", "choose another -o")
+    if resume and complete:
+        _check_resumable(output, begun, hidden)
     if overwrite:
         real_output(output)
         if output.is_dir() and any(output.iterdir()):
@@ -78,6 +79,18 @@ def check_output(output: Path, resume: bool, overwrite: bool, inputs: Iterable[P
         if strangers:
             found = f"{strangers[0]} is in it, and no run.json: it was not made by this program"
             raise InputError(output, found, "choose another -o, or move it elsewhere")
+
+
+def _check_resumable(output: Path, begun: bool, hidden: bool) -> None:
+    """Raises InputError where what says that it is complete is no training, or one that cannot go on."""
+    record = read_record(output)
+    if record is None and not begun:
+        raise InputError(output, f"not resumed, its {RECORD} is none of this program", "choose another -o")
+    if record is not None and record["verb"] != "train":
+        raise InputError(output, f"not resumed, it is of {record['verb']}", "choose another -o")
+    if record is not None and not hidden and not has_checkpoint(output):
+        found = "not resumed, it is complete, and its checkpoints are gone"
+        raise InputError(output, found, "choose another -o, or give --overwrite to start anew")
 
 
 def has_checkpoint(folder: Path) -> bool:
@@ -105,12 +118,8 @@ def training_folder(output: Path, resume: bool, overwrite: bool, inputs: Iterabl
             _put(made, real)
         hidden = made.is_dir() or (overwrite and real.is_dir() and any(real.iterdir()))
         folder = made if hidden else output
-        try:
+        with _kept_or_gone(folder, output, hidden):
             yield folder
-        except BaseException:
-            if hidden and not has_checkpoint(made):
-                discard(made)
-            raise
         if read_record(folder) is not None:
             (folder / BEGUN).unlink(missing_ok=True)
             if hidden:
@@ -118,6 +127,30 @@ def training_folder(output: Path, resume: bool, overwrite: bool, inputs: Iterabl
                     _put(made, real)
                 else:
                     replace(made, real, before)  # keeps both, and says where
+
+
+@contextmanager
+def _kept_or_gone(folder: Path, output: Path, hidden: bool) -> Iterator[None]:
+    """A block that fails keeps its checkpoints; without one, nothing is left of a run that it began."""
+    there, fresh = folder.is_dir(), not any((folder / name).exists() for name in (*_OURS, BEGUN, RECORD))
+    try:
+        yield
+    except BaseException as error:
+        kept = has_checkpoint(folder)
+        named = str(getattr(error, "filename", ""))
+        begun = folder.is_dir() or (isinstance(error, FileNotFoundError) and Path(named).is_relative_to(folder))
+        left = "Its checkpoints are kept: --resume goes on" if kept else "Nothing of it is kept"
+        failure = machine_failure(error, folder if begun else None, left, output)
+        if not kept and hidden:
+            discard(folder)
+        elif not kept and fresh:
+            _clear(folder)
+            if not there:
+                with suppress(OSError):  # others put something into it
+                    folder.rmdir()
+        if failure is not None:
+            raise failure from error
+        raise
 
 
 def begin_in(folder: Path) -> None:
@@ -135,10 +168,15 @@ def _is_begun(folder: Path) -> bool:
 def _put(made: Path, output: Path) -> None:
     """A whole run takes the place of the old one; an unfinished old one lists no files, and goes before."""
     if output.is_dir() and read_record(output) is None:
-        for name in (*_OURS, BEGUN):
-            path = output / name
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
+        _clear(output)
     replace(made, output, stamp(output))
+
+
+def _clear(folder: Path) -> None:
+    """Removes what a run wrote, and no other file."""
+    for name in (*_OURS, BEGUN):
+        path = folder / name
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)

@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging, Learn
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from lightdepth.errors import InputError
+from lightdepth.foreign_text import for_terminal
 from lightdepth.ranges import BELOW_ONE, at_least, checked
 from lightdepth.reporting.names import Names
 from lightdepth.signals import Received
@@ -113,6 +114,6 @@ class Echo:
     def __call__(self, line: str) -> None:
         if not first_process():
             return
-        print(line, file=sys.stderr, flush=True)
+        print(for_terminal(line), file=sys.stderr, flush=True)
         with self.log.open("a", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(self.names.text(line) + "\n")
+            file.write(for_terminal(self.names.text(line)) + "\n")

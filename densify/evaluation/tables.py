@@ -32,6 +32,7 @@ from densify.evaluation.records import (
 )
 from densify.evaluation.suite import Suite, alone
 from densify.judging.withheld import WithheldOfMap
+from lightdepth.foreign_text import for_table
 from lightdepth.reporting.report import number
 
 _METRICS = {
@@ -292,7 +293,8 @@ def write_evaluations(
         "\n".join([comments, *(t.latex() for t in tables)]), encoding="utf-8", errors="backslashreplace"
     )
     with (folder / "metrics.csv").open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
-        csv.writer(file).writerows(long_rows(results))
+        rows = long_rows(results)
+        csv.writer(file).writerows([for_table(v) if isinstance(v, str) else v for v in row] for row in rows)
     for name, evaluation in found.items():
         prefix = f"{name}_" if len(found) > 1 else ""
         if evaluation.curves:

@@ -19,6 +19,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.below import given
 from lightdepth.files.meshes import load_mesh
 from lightdepth.files.reading import reading
+from lightdepth.foreign_text import from_table
 from lightdepth.geometry import depth_from_distance
 from lightdepth.maps import read_map
 from lightdepth.maps.endocartoscope import TrajectoryPose, read_trajectory, trajectory_path
@@ -179,7 +180,7 @@ def _without_observations(folder: Path, dense: DenseMapFiles) -> Submap:
     if (folder / "keyframes.csv").is_file():
         path = folder / "keyframes.csv"
         with reading(path, "a table of keyframes"), path.open(encoding="utf-8", newline="") as file:
-            names |= {int(row["frame"]): row["keyframe"] for row in csv.DictReader(file)}
+            names |= {int(row["frame"]): from_table(row["keyframe"]) for row in csv.DictReader(file)}
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     keyframes = tuple(
         Keyframe(names[int(n)], dense.camera, np.linalg.inv(pose), *none)

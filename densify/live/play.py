@@ -23,6 +23,7 @@ from densify.predictions import Predictor
 from lightdepth.datasets import FrameSequence
 from lightdepth.depth_gate import DepthGate
 from lightdepth.errors import InputError
+from lightdepth.foreign_text import for_table
 from lightdepth.reporting.figures import chart, chart_png
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
@@ -235,8 +236,8 @@ def write_timings(played: Sequence[Played], path: Path) -> None:
             when = [f"{p.arrival:.3f}", f"{p.done:.3f}"]
             found = Ahead.of([p.ahead], 1, 1)
             shares = [f"{v:.4f}" if len(p.ahead) else "" for v in (found.number, found.columns.constant)]
-            last = [p.renewed, p.patches, p.kept_bytes // 1000, len(p.ahead), *shares, p.reason]
-            table.writerow([p.map, p.keyframe, *when, *row, *last])
+            last = [p.renewed, p.patches, p.kept_bytes // 1000, len(p.ahead), *shares, for_table(p.reason)]
+            table.writerow([p.map, for_table(p.keyframe), *when, *row, *last])
 
 
 def timings_picture(played: Sequence[Played], budget: float) -> bytes:

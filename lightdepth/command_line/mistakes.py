@@ -19,6 +19,7 @@ from lightdepth.command_line.kinds import choices_of_type, expected, list_apart,
 from lightdepth.command_line.pages import Page
 from lightdepth.command_line.settings_yaml import read_settings
 from lightdepth.command_line.words import dashed, options, underscored
+from lightdepth.foreign_text import for_terminal
 from lightdepth.regular import regular
 
 
@@ -30,7 +31,7 @@ def where_given(argv: Sequence[str], action: argparse.Action) -> str:
 
 def fail(parser: ArgumentParser, message: str) -> NoReturn:
     """Ends the program for wrong usage, with one line."""
-    print(f"{parser.prog}: error: {' '.join(message.split())}", file=sys.stderr)
+    print(for_terminal(f"{parser.prog}: error: {' '.join(message.split())}"), file=sys.stderr)
     raise SystemExit(2)
 
 

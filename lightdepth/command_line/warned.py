@@ -6,6 +6,8 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from lightdepth.foreign_text import for_terminal
+
 
 @contextmanager
 def warnings_as_sentences() -> Iterator[None]:
@@ -18,7 +20,7 @@ def warnings_as_sentences() -> Iterator[None]:
     ) -> str:
         if not issubclass(category, UserWarning):
             return as_python(message, category, filename, lineno, line)
-        return f"warning: {' '.join(str(message).split())}\n"
+        return for_terminal(f"warning: {' '.join(str(message).split())}") + "\n"
 
     warnings.formatwarning = formatted
     try:

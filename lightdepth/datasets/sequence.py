@@ -151,7 +151,7 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     """Files whose whole name matches `pattern`, by the integer in its first group; 12 and 0012 are the same."""
     found: dict[int, Path] = {}
     for file in sorted(folder.iterdir()) if folder.is_dir() else ():
-        match = re.fullmatch(pattern, file.name)
+        match = re.fullmatch(pattern, file.name, re.DOTALL)
         if match:
             number = int(match[1])
             if number in found:

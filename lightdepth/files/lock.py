@@ -35,9 +35,7 @@ def locked(output: Path) -> Iterator[None]:
     path, descriptor = lock_path(output), None
     try:
         with finishing_first():
-            descriptor = _opened(path, output)
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
+            descriptor = _held(path, output)
         yield
     finally:
         if descriptor is not None:
@@ -81,13 +79,29 @@ def is_lock(path: Path) -> bool:
         os.close(descriptor)
 
 
+def _held(path: Path, output: Path) -> int:
+    """The lock file, held, with what we say in it. An OSError names the output: the user does not know of the lock."""
+    descriptor = None
+    try:
+        descriptor = _opened(path, output)
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, json.dumps(_ourselves()).encode(), 0)
+    except OSError as error:
+        if descriptor is not None:
+            path.unlink(missing_ok=True)
+            os.close(descriptor)
+        error.filename = str(output)
+        raise
+    return descriptor
+
+
 def _opened(path: Path, output: Path) -> int:
     """The lock file, held."""
     while True:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | _AS_IT_IS, 0o644)
         except OSError as error:
-            if error.errno != errno.ELOOP:
+            if error.errno not in (errno.ELOOP, errno.EISDIR):
                 raise
             raise _in_the_way(path, output) from error  # a link: what it leads to would be written over
         try:

@@ -56,11 +56,22 @@ def machine_failure(
     return MachineFailure(". ".join(filter(None, (said, kept))))
 
 
+def is_lost() -> bool:
+    """Whether the folder that the process is in is gone, so that no name without a folder means anything."""
+    try:
+        os.getcwd()
+    except OSError:
+        return True
+    return False
+
+
 def _reason(error: BaseException, folder: Path | None) -> str | None:
     if isinstance(error, MemoryError) or (
         isinstance(error, RuntimeError) and any(sign in str(error) for sign in _MEMORY)
     ):
         return FAILS[errno.ENOMEM]
+    if isinstance(error, FileNotFoundError) and is_lost():
+        return "the folder that you are in is gone"
     if isinstance(error, OSError) and error.errno in FAILS:
         return FAILS[error.errno]
     if folder is None or isinstance(error, InputError | PartialFailure) or not isinstance(error, Exception):

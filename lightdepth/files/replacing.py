@@ -157,6 +157,11 @@ def check_replaceable(output: Path, verb: str) -> None:
         if path not in ours:
             found = f"not overwritten, {path.relative_to(output)} in it is not of the run that made it"
             raise InputError(output, found, "move that file elsewhere, or choose another -o")
+    for place in sorted({path.parent for path in ours}):
+        if not os.access(place, os.W_OK | os.X_OK):  # it could be moved aside, but not be removed
+            which = "it" if place == output else f"{place.relative_to(output)} in it"
+            found = f"not overwritten, {which} is protected, and you may not change what is there"
+            raise InputError(output, found, "choose another -o, or lift the protection (chmod u+w)")
 
 
 def check_apart(output: Path, inputs: Iterable[Path]) -> None:
@@ -164,11 +169,23 @@ def check_apart(output: Path, inputs: Iterable[Path]) -> None:
     output = output.resolve()
     for path in inputs:
         try:
-            inside = path.exists() and path.resolve().is_relative_to(output)
+            inside = path.exists() and _lies_in(path.resolve(), output)
         except (OSError, ValueError, RuntimeError):  # no path after all: too long, or links in a circle
             continue
         if inside:
             raise InputError(output, f"not overwritten, {path} is read from it", "choose another -o")
+
+
+def _lies_in(path: Path, folder: Path) -> bool:
+    """Whether a path is a folder or below it: by name, or under another one (a folder that is mounted at two places; a
+    disk that takes capital letters for small ones)."""
+    if path.is_relative_to(folder):
+        return True
+    try:
+        same = folder.stat()
+    except OSError:
+        return False
+    return any(os.path.samestat(place.stat(), same) for place in (path, *path.parents))
 
 
 def check_files(paths: Iterable[Path], overwrite: bool, inputs: Iterable[Path | None] = ()) -> None:
@@ -270,7 +287,8 @@ def remove_owned(folder: Path) -> bool:
         *sorted(ours - records),
         *sorted(records, reverse=True),
     ]:  # the lists go last, the outermost at the end
-        path.unlink(missing_ok=True)
+        with suppress(PermissionError):  # protected since: it shows itself again
+            path.unlink(missing_ok=True)
     for place, _, _ in os.walk(folder, topdown=False):
         with suppress(OSError):  # another's file is in it
             os.rmdir(place)

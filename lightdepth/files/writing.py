@@ -33,6 +33,9 @@ _LONGEST = 255
 _BEFORE = len(PARTIAL) + 8 + 1 + 9 + 1
 """Bytes that stand before the real name at the most, whatever number the process has: killed runs had others."""
 
+_MORE = bytes(1 << 16)
+"""What a file is asked to take where a library that wrote it failed for a reason of its own."""
+
 _NOT_HERE = (errno.EINVAL, errno.ENOTSUP)
 """Some file systems cannot bring a folder to the disk, and say so; a finished run is not lost over it."""
 
@@ -105,6 +108,7 @@ def check_writable(path: Path) -> None:
                 _remove(probe)
     except OSError as error:
         if error.errno in FAILS:
+            error.filename = os.fspath(path)
             raise
         raise InputError(path, f"cannot be written ({error.strerror or error})", "choose another place") from error
 
@@ -207,4 +211,23 @@ def _write(path: Path, content: Content) -> None:
     elif isinstance(content, bytes):
         path.write_bytes(content)
     else:
-        content(path)
+        try:
+            content(path)
+        except (OSError, InputError):
+            raise
+        except Exception:
+            _check_room(path)
+            raise
+
+
+def _check_room(file: Path) -> None:
+    """Raises the system's OSError where it does not let a file grow: for libraries that only say that they failed. The
+    file is longer afterwards."""
+    try:
+        with file.open("ab") as end:
+            end.write(_MORE)
+            end.flush()
+            os.fsync(end.fileno())
+    except OSError as error:
+        if error.errno in FAILS:
+            raise

@@ -33,6 +33,7 @@ from lightdepth.files.replacing import (
     unfinished_path,
 )
 from lightdepth.files.writing import folders_for, sync_below, usual_mode
+from lightdepth.foreign_text import for_terminal
 from lightdepth.reporting.names import KEPT, Names, names_of, spoken
 from lightdepth.reporting.record import write_run_json
 from lightdepth.reporting.same import check_finished, check_same, compared, own_version
@@ -124,12 +125,12 @@ class Run:
     def log(self, message: str) -> None:
         """A line for log.txt, and for the user, who reads the names of options in the place of their paths."""
         self._say = self._say or (str if self.keep_names else spoken(self._given))
-        print(self._say(message), flush=True)
+        print(for_terminal(self._say(message)), flush=True)
         self._note(message)
 
     def _note(self, message: str) -> None:
         with (self.folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(f"{time.strftime('%H:%M:%S')} {message}\n")
+            file.write(f"{time.strftime('%H:%M:%S')} {for_terminal(message)}\n")
 
     def fail(self, what: str, reason: str) -> None:
         """Part of the work failed; the rest goes on (exit code 4 at the end)."""

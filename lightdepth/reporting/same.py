@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, is_dataclass
 from importlib import metadata
@@ -24,7 +25,23 @@ def check_finished(output: Path, verb: str, arguments: Mapping[str, Any]) -> Non
     if record is None:
         raise InputError(output, "not resumed, it holds no run of this program", "choose another -o")
     check_same(output, with_real_inputs(record, output), verb, arguments)
+    _check_whole(output, record)
     raise AlreadyFinished(f"{output.name} is already finished")
+
+
+def _check_whole(output: Path, record: Mapping[str, Any]) -> None:
+    """Raises InputError where a file that the run wrote is gone, or is another; not for what others are not given."""
+    files = record.get("files")
+    for name, size in files.items() if isinstance(files, Mapping) else ():
+        path = output / name
+        if name == INPUTS or "\0" in name:
+            continue
+        if not os.path.lexists(path):
+            found = f"not resumed, it is finished, but {name} of it is gone"
+            raise InputError(output, found, "give --overwrite to start anew, or choose another -o")
+        if path.lstat().st_size != size:
+            found = f"not resumed, it is finished, but {name} of it was changed since"
+            raise InputError(output, found, "choose another -o, or remove it yourself")
 
 
 def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Mapping[str, Any]) -> None:

@@ -20,6 +20,7 @@ from typing import TypedDict
 import numpy as np
 
 from lightdepth.files.writing import write_whole
+from lightdepth.foreign_text import for_table
 from lightdepth.reporting.record import git_revision
 
 from ..colons import TubeData, colon_seeds
@@ -205,7 +206,16 @@ def _csv(table: AblationTable) -> str:
                 for key in METRICS:
                     mine, closed = errors[key], r.closed_form[name][key]
                     writer.writerow(
-                        [r.row, r.seed, told, name, key, f"{mine:.6g}", f"{closed:.6g}", f"{mine / closed:.4f}"]
+                        [
+                            for_table(r.row),
+                            r.seed,
+                            told,
+                            name,
+                            key,
+                            f"{mine:.6g}",
+                            f"{closed:.6g}",
+                            f"{mine / closed:.4f}",
+                        ]
                     )
     return text.getvalue()
 

@@ -10,6 +10,7 @@ same frames of colons that none of them saw. Rows that are already there are kep
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Mapping
@@ -21,9 +22,11 @@ from lightdepth.files import replacing
 from lightdepth.files.lock import locked
 from lightdepth.files.named_inputs import INPUTS, write_inputs
 from lightdepth.files.replacing import (
+    RECORD,
     check_replaceable,
     check_rewritable,
     hidden,
+    read_record,
     real_output,
     recover,
     stamp,
@@ -106,7 +109,9 @@ def ablate(
 
 
 def _check_ours(output: Path) -> None:
-    """Raises InputError where a folder holds what no ablation writes: it would be listed as the run's."""
+    """Raises InputError where a folder holds what no ablation writes: it would be listed as the run's, or replaced."""
+    if os.path.lexists(output / RECORD) and ((record := read_record(output)) is None or record["verb"] != "ablate"):
+        raise InputError(output, f"holds a {RECORD} that is of no ablation", "choose another -o")
     for path in sorted(output.iterdir()) if output.is_dir() else ():
         if path.name not in _OURS and not re.fullmatch(r"seed_-?\d+", path.name) and not hidden(path):
             raise InputError(output, f"holds {path.name}, which is of no ablation", "choose another -o")

@@ -24,6 +24,7 @@ from lightdepth.datasets.with_map import open_with_map
 from lightdepth.errors import AlreadyFinished, InputError
 from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import Content, write_together
+from lightdepth.foreign_text import for_table, for_terminal
 from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
 from lightdepth.ranges import Range, checked
@@ -163,7 +164,7 @@ def select(
         write_together(writers)
         if no_frames:
             paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
-    print(f"{summary}\n{', '.join(str(path) for path in writers)}")
+    print(for_terminal(f"{summary}\n{', '.join(str(path) for path in writers)}"))
 
 
 @dataclass(frozen=True)
@@ -267,7 +268,7 @@ def _table(verdicts: Sequence[FrameVerdict]) -> str:
     writer.writerow([f.name for f in fields(FrameVerdict)])
     for verdict in verdicts:
         row = [int(v) if isinstance(v, bool) else f"{v:.4f}" if isinstance(v, float) else v for v in astuple(verdict)]
-        writer.writerow(row)
+        writer.writerow(for_table(v) if isinstance(v, str) else v for v in row)
     return buffer.getvalue()
 
 

@@ -1,0 +1,96 @@
+"""The folder of a training: what is left in it when the machine fails, and whose runs are gone on with."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+from raising import refused
+from training import TINY_RUN
+
+from lightdepth.cli import main
+from lightdepth.files.writing import write_whole
+from train.commands.train import train
+
+
+@contextmanager
+def files_up_to(size: int) -> Iterator[None]:
+    """No file grows beyond so many bytes, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "first"
+    assert train(["-o", str(run), *TINY_RUN, "--trainer.max_steps", "2"]) == 0
+    return run
+
+
+def test_a_library_that_only_says_that_it_failed_does_not_hide_a_full_disk(tmp_path):
+    with files_up_to(1 << 16), pytest.raises(OSError, match="too large") as failed:
+        write_whole(tmp_path / "a.ckpt", lambda path: torch.save({"weights": torch.zeros(1 << 16)}, path))
+    assert failed.value.filename == str(tmp_path / "a.ckpt") and not list(tmp_path.iterdir())
+
+    def mistaken(path: Path) -> None:
+        raise RuntimeError("a mistake of ours")
+
+    with pytest.raises(RuntimeError, match="a mistake of ours"):
+        write_whole(tmp_path / "a.ckpt", mistaken)
+
+
+def test_a_checkpoint_that_finds_no_room_ends_a_training_with_a_sentence_and_without_remains(tmp_path, capsys):
+    given = ["train", "-o", str(tmp_path / "run"), *TINY_RUN, "--trainer.max_steps", "2"]
+    with files_up_to(1 << 16):
+        code = main(given)
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert code == 5 and "Nothing of it is kept" in said and "MB are free" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_is_full_costs_neither_the_old_result_nor_the_last_checkpoint(finished_run, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished_run, run)
+    before = contents(run)
+    with files_up_to(1 << 16):
+        assert main(["train", "-o", str(run), *TINY_RUN, "--trainer.max_steps", "2", "--overwrite"]) == 5
+        assert contents(run) == before and os.listdir(tmp_path) == ["run"]
+        assert main(["train", "-o", str(run), "--resume", "--trainer.max_steps", "4"]) == 5
+    assert "--resume goes on" in capsys.readouterr().err.splitlines()[-1]
+    assert train(["-o", str(run), "--resume", "--trainer.max_steps", "4"]) == 0
+
+
+def test_a_folder_of_another_program_is_not_gone_on_with_for_a_file_of_the_name_of_ours(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "run.json").write_text('{"mine": 1}')
+    (run / "log.txt").write_text("mine")
+    before = contents(run)
+    with refused("run.json is none of this program", cure="another -o"):
+        train(["-o", str(run), *TINY_RUN, "--resume"])
+    assert contents(run) == before
+
+
+def test_a_whole_run_without_its_checkpoints_is_not_replaced_unasked(finished_run, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished_run, run)
+    shutil.rmtree(run / "checkpoints")
+    before = contents(run)
+    with refused("its checkpoints are gone", cure="--overwrite"):
+        train(["-o", str(run), "--resume", "--trainer.max_steps", "4"])
+    assert contents(run) == before and json.loads(before["run.json"])["steps"] == 2
