@@ -38,7 +38,8 @@ class SequenceSource:
     files say, else what their highest values show. A larger one reads the same numbers as darker."""
     fov: Annotated[float | None, Range(10, 175)] = None
     """Field of view across the image's width, degrees, at which --camera auto (which it implies) starts, and which is
-    assumed where the frames do not connect. A larger one means a shorter focal length. Left out, several are tried."""
+    assumed where the frames do not connect or their motion hardly tells it. A larger one means a shorter focal length.
+    Left out, several are tried."""
 
     @property
     def asks_for_camera(self) -> bool:
