@@ -55,6 +55,8 @@ class Densified:
         """With a run that can be resumed, each submap is a finished part of it, and so are the joined ones."""
         gallery = Gallery(sparse_map)
         count = sum(len(s.keyframes) for s in sparse_map.submaps)
+        if run is not None:
+            run.log(f"surfaces: {count} keyframes are aligned together, then fused one by one")
         with Progress("Densifying", count) as bar:
 
             def show(submap: Submap, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:

@@ -167,6 +167,7 @@ def doubts_of_inputs(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> 
     cameras = _uncertain_cameras(sparse_map)
     for known in cameras:
         run.warn_once(known.doubt)
+    run.log("colours: those of the keyframes are looked at")
     row_of = {number: row for row, number in enumerate(frames.numbers)}
     keyframes = [row_of[k.number] for s in sparse_map.submaps for k in s.keyframes if k.number in row_of]
     colours = colours_of(frames, keyframes)

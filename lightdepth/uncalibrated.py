@@ -17,6 +17,7 @@ from lightdepth.calibration import write_camera
 from lightdepth.calibration.json_files import camera_from_fields, fields_of
 from lightdepth.camera import CameraModel, Provenance
 from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.reading import size_of_frames
 from lightdepth.errors import InputError
 from lightdepth.files.working import working_folder
@@ -40,7 +41,10 @@ def open_frames(
     Raises InputError where no camera can be found and no field of view was given to assume.
     """
     if not source.asks_for_camera:
-        return source.open(map_camera)
+        try:
+            return source.open(map_camera)
+        except NoCamera as error:
+            raise error.of_verb_that_finds_one() from error
     if map_camera is not None:
         check_camera_asked(source)
     return with_camera(source, run, config).open()

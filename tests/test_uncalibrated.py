@@ -156,6 +156,30 @@ def test_a_calibration_that_is_converted_says_what_the_new_file_cannot_hold(tmp_
     assert read_camera(tmp_path / "other.json").provenance == UNSURE
 
 
+@pytest.mark.parametrize("verb", ["predict", "densify", "live", "sparse", "train", "adapt", "select"])
+def test_frames_without_a_calibration_are_refused_with_what_this_verb_takes(verb, made, tmp_path, capsys):
+    data = (
+        ["--preset", "tube_smoke", "--data.sequences", f"[{made / 'frames'}]"] if verb == "train" else [made / "frames"]
+    )
+    assert lightdepth(verb, *data, "-o", tmp_path / "out") == 3
+    told = " ".join(capsys.readouterr().err.split())
+    first = f"make a sequence with one first: lightdepth import {made / 'frames'} --camera auto -o DATA"
+    option = "--data.camera" if verb == "train" else "--camera"
+    finds = verb in ("predict", "densify", "live", "sparse")
+    assert f"no camera.json; give {option} FILE" in told
+    assert (first in told) != finds and ("--camera auto to find it from the motion" in told) == finds
+    assert "--map" not in told or verb != "train"
+
+
+def test_train_names_its_own_options_for_what_is_wrong_with_its_frames(tmp_path, capsys):
+    for part, dtype in (("color", np.uint8), ("depth", np.uint16)):  # Hamlyn's, without its intrinsics.txt
+        (tmp_path / "seq" / part).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "seq" / part / "0000000000.png"), np.full((40, 50), 90, dtype))
+    data = ["--data.sequences", f"[{tmp_path / 'seq'}]"]
+    assert lightdepth("train", "--preset", "tube_smoke", *data, "-o", tmp_path / "out") == 3
+    assert "give --data.camera FILE" in " ".join(capsys.readouterr().err.split())
+
+
 def guessed(deviation: float, fov: float | None, field: float = 136.0) -> SelfCalibration:
     """What a motion came to that says `field` degrees."""
     return SelfCalibration(across(640, 480, field), deviation, 0.6, 12, 12, 900, (389.0,), fov)

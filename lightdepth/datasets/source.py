@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from lightdepth.camera import CameraModel
+from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.reading import FormatName, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.errors import InputError
@@ -50,14 +51,18 @@ class SequenceSource:
         return auto or self.fov is not None
 
     def open(self, map_camera: CameraModel | None = None) -> FrameSequence:
-        """The frames; `map_camera` as for open_sequence. Raises InputError where they cannot be read."""
+        """The frames; `map_camera` as for open_sequence. Raises InputError where they cannot be read, NoCamera for
+        verbs that find none."""
         if self.asks_for_camera:
             raise InputError(
                 "--camera auto" if self.fov is None else "--fov",
                 "this verb finds no camera",
                 f"make a sequence with one first: lightdepth import {self.data} --camera auto -o DATA",
             )
-        return open_sequence(self.data, self.format, self.camera, self.light, self.mask, map_camera, self.bit_depth)
+        try:
+            return open_sequence(self.data, self.format, self.camera, self.light, self.mask, map_camera, self.bit_depth)
+        except NoCamera as error:
+            raise error.of_other_verb(self.data) from error
 
     @property
     def files(self) -> dict[str, Path | None]:
