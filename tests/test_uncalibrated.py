@@ -24,7 +24,7 @@ from lightdepth.maps import read_map
 from lightdepth.maps.colmap import write_text_model
 from lightdepth.reporting.run import run_folder
 from lightdepth.sfm.self_calibration import SelfCalibration, across
-from lightdepth.uncalibrated import found_camera
+from lightdepth.uncalibrated import found_camera, with_camera
 
 NOTE = "self-calibrated from 24 of 24 frames. The motion does not tell it within 3 %: give a calibration"
 UNSURE = Provenance("self-calibrated", 0.156, NOTE)
@@ -207,3 +207,17 @@ def test_the_camera_of_a_worthless_estimate_is_the_stated_one_and_it_is_said(dev
         assert "110 degrees across, as --fov says" in warned and "+- 100.0 % (136 degrees across)" in warned
     else:
         assert "Give frames with more sideways motion or a calibration" in warned and "--fov" not in warned
+
+
+def test_a_resumed_run_has_the_camera_that_was_found_with_its_doubt(tmp_path, monkeypatch):
+    source = SequenceSource(written(tmp_path / "data", box_film(across(60, 50, 90), 4)), camera=Path("auto"))
+    monkeypatch.setattr("lightdepth.uncalibrated.self_calibrated", lambda frames, config, fov: guessed(0.1, fov))
+    with pytest.raises(KeyboardInterrupt), run_folder(tmp_path / "run", "predict", {}, resume=False) as run:
+        run.hash_inputs(data=source.data)
+        first = read_camera(with_camera(source, run).files["camera"])
+        raise KeyboardInterrupt
+    monkeypatch.delattr("lightdepth.uncalibrated.self_calibrated")
+    with run_folder(tmp_path / "run", "predict", {}, resume=True) as run:
+        again = read_camera(with_camera(source, run).files["camera"])
+    assert again == first and again.provenance == first.provenance is not None
+    assert said(tmp_path / "run") == [again.provenance.doubt]
