@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field, fields
 from functools import cached_property
@@ -291,7 +292,11 @@ def read_dense_map(folder: str | Path) -> DenseMapFiles:
     if not (map_id.isascii() and map_id.isdigit()):
         raise InputError(folder, "no number of a map in its name", "expected a name such as map_000 or joined_000")
     with reading(folder, "a readable map folder"):
-        return _dense_map(folder, int(map_id))
+        found = _dense_map(folder, int(map_id))
+    known = found.camera.provenance
+    if known is not None and known.doubt:
+        warnings.warn(known.doubt, stacklevel=2)
+    return found
 
 
 def _dense_map(folder: Path, map_id: int) -> DenseMapFiles:

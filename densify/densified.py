@@ -55,6 +55,8 @@ class Densified:
         """With a run that can be resumed, each submap is a finished part of it, and so are the joined ones."""
         gallery = Gallery(sparse_map)
         count = sum(len(s.keyframes) for s in sparse_map.submaps)
+        if run is not None:
+            run.log(f"surfaces: {count} keyframes are aligned together, then fused one by one")
         with Progress("Densifying", count) as bar:
 
             def show(submap: Submap, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
@@ -232,7 +234,7 @@ class Densified:
 
 def unsure(share: float, config: DensifyConfig) -> str:
     """What was left out of a surface because it is expected to be wrong, in words."""
-    return f"{share:.0%} of the pixels are left out, expected to err by more than {config.fusion.max_error:g} %"
+    return f"{share:.0%} of the pixels are left out: each is expected to be off by more than {config.fusion.max_error:g} %"
 
 
 def note_recipe(run: Run, config: DensifyConfig) -> None:

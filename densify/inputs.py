@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 
 from densify.config import MethodConfig
 from densify.placing import Placing
-from lightdepth.camera import CameraModel
+from lightdepth.calibration import write_camera
+from lightdepth.camera import CameraModel, Provenance
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.coloured import colours_of
 from lightdepth.datasets.pairing import check_shared_frames
@@ -30,7 +31,7 @@ from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.keeping import KeptDatabase
 from lightdepth.sfm.made import made_sparse
 from lightdepth.sfm.repair import Repair, repaired_submap
-from lightdepth.sparse_map import Keyframe, SparseMap, Submap
+from lightdepth.sparse_map import Keyframe, SparseMap, Submap, with_provenance
 from lightdepth.uncalibrated import check_camera_asked, open_frames
 
 
@@ -133,8 +134,10 @@ def repaired(run: Run, sparse_map: SparseMap, frames: FrameSequence, config: Sfm
         new, repair = kept(run, f"repair {submap.id}", _Repaired, make, folder=folder).both
         worse = repair.left or len(new.keyframes) < len(seen)
         (run.warn if worse else run.log)(f"repair: {repair}")
-        submaps.append(new)
+        submaps.append(with_provenance(new, submap.keyframes[0].camera.provenance))
         told.append(repair)
+    if submaps[0].keyframes[0].camera.provenance is not None:
+        write_camera(submaps[0].keyframes[0].camera, run.folder / "camera.json")
     run.record["repair"] = plain(told)
     return replace(sparse_map, submaps=tuple(submaps))
 
@@ -158,8 +161,13 @@ class _Repaired:
 
 
 def doubts_of_inputs(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> tuple[str, ...]:
-    """Sentences on map and frames with which no verdict is green: frames that may not be the map's, and light that was
-    not white and steady, which is looked at here, said and recorded."""
+    """Sentences on map and frames with which no verdict is green: frames that may not be the map's, a camera whose
+    focal length nobody knows well, and light that was not white and steady, which is looked at here, said and
+    recorded."""
+    cameras = _uncertain_cameras(sparse_map)
+    for known in cameras:
+        run.warn_once(known.doubt)
+    run.log("colours: those of the keyframes are looked at")
     row_of = {number: row for row, number in enumerate(frames.numbers)}
     keyframes = [row_of[k.number] for s in sparse_map.submaps for k in s.keyframes if k.number in row_of]
     colours = colours_of(frames, keyframes)
@@ -168,7 +176,13 @@ def doubts_of_inputs(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> 
     run.record["colour"] = colours.record()
     pairing = run.record.get("pairing") or {}
     doubtful = pairing.get("judgement") in ("doubtful", "wrong")
-    return (*([pairing["sentence"]] if doubtful else []), *colours.doubts)
+    return (*([pairing["sentence"]] if doubtful else []), *(known.in_short for known in cameras), *colours.doubts)
+
+
+def _uncertain_cameras(sparse_map: SparseMap) -> list[Provenance]:
+    """Of the cameras that surfaces are made with, those with a doubt."""
+    found = (k.camera.provenance for submap in sparse_map.submaps for k in submap.keyframes)
+    return [known for known in dict.fromkeys(found) if known is not None and known.doubt]
 
 
 @dataclass(frozen=True)

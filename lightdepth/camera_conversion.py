@@ -7,7 +7,7 @@ distortion. The rays through the pixels of the first camera are the data; least 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -131,7 +131,7 @@ def _start(
         powers = np.array([0, 2, 3, 4])
         shape = np.linalg.lstsq((rho[:, None] / reach) ** powers, height)[0] / reach**powers
         return [x, y, *shape.tolist(), 1, 0, 0], [focal, focal, *(focal / reach**powers).tolist(), 0.1, 0.1, 0.1]
-    distortion = len(fields(model)) - 6
+    distortion = len(model.parameters()) - 4
     return [focal, focal, x, y, *[0.0] * distortion], [*[focal] * 4, *[0.1] * distortion]
 
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from lightdepth.brief import Brief
-from lightdepth.camera import CameraModel
+from lightdepth.camera import CameraModel, Provenance
 from lightdepth.errors import InputError
 from lightdepth.frame import frame_number
 
@@ -174,6 +174,12 @@ class SparseMap(Brief):
         twice = sorted(i for i, times in Counter(s.id for s in self.submaps).items() if times > 1)
         if twice:
             raise InputError(self.source, f"two maps have the id {twice[0]}", "every submap needs its own")
+
+
+def with_provenance(submap: Submap, provenance: Provenance | None) -> Submap:
+    """The submap, whose files could not say where its camera is from."""
+    keyframes = tuple(replace(k, camera=replace(k.camera, provenance=provenance)) for k in submap.keyframes)
+    return replace(submap, keyframes=keyframes)
 
 
 def near_origin(submap: Submap) -> Submap:

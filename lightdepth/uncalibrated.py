@@ -1,24 +1,23 @@
 """Frames of an endoscope whose calibration nobody has: opened with a camera found from their own motion.
 
-`--camera auto` finds it, `--fov DEGREES` is where to start and what is assumed where the frames do not connect. Some
-frames of a stretch are mapped by pycolmap (sfm.self_calibration); the camera is written to camera.json in the run
-folder with its deviation, and said.
+`--camera auto` finds it, `--fov DEGREES` is where to start, and what is assumed where the frames do not connect or
+their motion hardly tells it. Some frames of a stretch are mapped by pycolmap (sfm.self_calibration); the camera is
+written to camera.json in the run folder with its deviation, and said.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lightdepth.calibration import write_camera
-from lightdepth.calibration.json_files import write_found_camera
-from lightdepth.camera import CameraModel, camera_from_params
+from lightdepth.calibration.json_files import camera_from_fields, fields_of
+from lightdepth.camera import CameraModel, Provenance
 from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.reading import size_of_frames
 from lightdepth.errors import InputError
 from lightdepth.files.working import working_folder
@@ -42,10 +41,13 @@ def open_frames(
     Raises InputError where no camera can be found and no field of view was given to assume.
     """
     if not source.asks_for_camera:
-        return source.open(map_camera)
+        try:
+            return source.open(map_camera)
+        except NoCamera as error:
+            raise error.of_verb_that_finds_one() from error
     if map_camera is not None:
         check_camera_asked(source)
-    return with_camera(source, run, config)[0].open()
+    return with_camera(source, run, config).open()
 
 
 def check_camera_asked(source: SequenceSource) -> None:
@@ -58,53 +60,25 @@ def check_camera_asked(source: SequenceSource) -> None:
         )
 
 
-def with_camera(
-    source: SequenceSource, run: Run, config: SfmConfig | None = None
-) -> tuple[SequenceSource, Found | None]:
-    """The source with its camera in the run's camera.json, found first where it asks for that; and how it was found."""
+def with_camera(source: SequenceSource, run: Run, config: SfmConfig | None = None) -> SequenceSource:
+    """The source with its camera in the run's camera.json, found first where it asks for that."""
     if not source.asks_for_camera:
-        return source, None
+        return source
     if run.done(_PART):
-        found, told = Found.of(run.kept_of(_PART)), run.kept_of(_PART)["told"]
-        run.record |= told
+        known = run.kept_of(_PART)
+        run.record |= known["told"]
+        camera = camera_from_fields(known["camera"], "the camera that was found")
     else:
-        found = found_camera(source, run, config)
+        camera = found_camera(source, run, config)
         told = {name: run.record[name] for name in ("self_calibration",) if name in run.record}
-        run.finish_part(_PART, [], found.kept() | {"told": told})
-    file = run.folder / "camera.json"
-    found.write(file)
-    return replace(source, camera=file, fov=None), found
+        run.finish_part(_PART, [], {"camera": fields_of(camera), "told": told})
+    write_camera(camera, run.folder / "camera.json")
+    return replace(source, camera=run.folder / "camera.json", fov=None)
 
 
-@dataclass(frozen=True)
-class Found:
-    """A camera that nobody calibrated, and what camera.json says of it."""
-
-    camera: CameraModel
-    source: Literal["self-calibrated", "assumed"]
-    deviation: float | None
-    note: str
-
-    @classmethod
-    def of(cls, kept: Mapping[str, Any]) -> Found:
-        """Of what `kept` gave."""
-        model, width, height, *params = kept["camera"]
-        camera = camera_from_params(model, width, height, params, "the camera that was found")
-        return cls(camera, kept["source"], kept["deviation"], kept["note"])
-
-    def kept(self) -> dict[str, Any]:
-        """As plain values."""
-        c = self.camera
-        return vars(self) | {"camera": [c.name, c.width, c.height, *c.params]}
-
-    def write(self, file: Path, camera: CameraModel | None = None) -> None:
-        """camera.json; of another camera where the images were cut or resized."""
-        write_found_camera(camera or self.camera, file, self.source, self.deviation, self.note)
-
-
-def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = None) -> Found:
-    """The camera of the source's frames with how sure it is, or the one of its field of view where they do not
-    connect. Said in the run."""
+def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = None) -> CameraModel:
+    """The camera of the source's frames, which says how sure it is; the one of its field of view where they do not
+    connect, or where their motion hardly tells it. Said in the run."""
     width, height = size_of_frames(source.data, source.format)
     with working_folder() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the frames are opened again, under the camera that is found
@@ -116,10 +90,7 @@ def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = No
         except InputError as error:
             if source.fov is None:
                 raise
-            note = f"assumed: a pinhole {source.fov:g} degrees across, as --fov says, not calibrated"
-            run.warn(f"the camera is {note}: {error.found}; lengths and shapes may be wrong")
-            return Found(across(width, height, source.fov), "assumed", None, note)
-    (run.log if found.told else run.warn)(str(found))
+            return _assumed(run, (width, height), source.fov, error.found)
     run.record["self_calibration"] = {
         "focal_length_px": round(found.camera.focal_length, 3),
         "deviation": round(found.deviation, 5),
@@ -127,7 +98,19 @@ def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = No
         "frames": found.mapped,
         "focal_lengths_from_starts_px": list(found.from_starts),
     }
-    return Found(found.camera, "self-calibrated", found.deviation, str(found))
+    if source.fov is not None and found.leaves_stated_field:
+        why = f"the motion of {found.mapped} of {found.frames} frames does not tell it ({found.found})"
+        return _assumed(run, (width, height), source.fov, why)
+    (run.log if found.told else run.warn)(str(found))
+    return replace(found.camera, provenance=Provenance("self-calibrated", round(found.deviation, 5), str(found)))
+
+
+def _assumed(run: Run, size: tuple[int, int], fov: float, why: str) -> CameraModel:
+    """The pinhole of a field that was stated, degrees across the width, and why nothing better is known."""
+    note = f"the camera is assumed: a pinhole {fov:g} degrees across, as --fov says, not calibrated: {why}"
+    note = f"{note}; lengths and shapes may be wrong"
+    run.warn(note)
+    return replace(across(*size, fov), provenance=Provenance("assumed", None, note))
 
 
 def _found(frames: FrameSequence, fov: float | None, run: Run, config: SfmConfig | None) -> SelfCalibration:

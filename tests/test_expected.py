@@ -53,9 +53,9 @@ def test_what_is_expected_to_err_by_more_than_asked_is_left_out_and_the_rest_sta
     sigma = np.full(BALL.distance.shape, 0.09, np.float32)
     sigma[:, 60:] = 0.16
     prediction = replace(BALL, uncertainty=sigma)
-    alignment = Alignment("1", scale=2.0, range_90=2 * REACH)
+    applied = Alignment("1", scale=2.0).applied(prediction)
     for most, kept in ((9.0, slice(60)), (3.0, slice(0)), (30.0, slice(None))):
-        found = sure(alignment, prediction, GREY, FusionConfig(max_error=most))
+        found = sure(applied, 2 * REACH, GREY, FusionConfig(max_error=most))
         expected = np.zeros_like(BALL.valid)
         expected[:, kept] = BALL.valid[:, kept]
         assert np.array_equal(found.valid, expected)
@@ -63,7 +63,7 @@ def test_what_is_expected_to_err_by_more_than_asked_is_left_out_and_the_rest_sta
 
 
 def test_what_is_left_out_is_told_with_the_limit():
-    assert unsure(0.123, DensifyConfig()) == "12% of the pixels are left out, expected to err by more than 12 %"
+    assert unsure(0.123, DensifyConfig()) == "12% of the pixels are left out: each is expected to be off by more than 12 %"
     assert unsure(0.0, DensifyConfig(fusion=FusionConfig(max_error=5.5))).endswith("5.5 %")
     with pytest.raises(Exception, match="max_error"):
         FusionConfig(max_error=0.0)

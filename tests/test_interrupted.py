@@ -211,7 +211,7 @@ def test_a_run_stopped_or_killed_at_its_end_still_has_its_finished_parts(tmp_pat
     with monkeypatch.context() as patched, suppress(KeyboardInterrupt):  # killed when it was whole already
         patched.setattr(reporting, "clear_notes", lambda *given: (_ for _ in ()).throw(KeyboardInterrupt))
         patched.setattr(reporting, "discard", lambda folder: None)
-        patched.setattr(reporting, "_kept_or_gone", lambda *given: nullcontext())
+        patched.setattr(reporting, "kept_or_gone", lambda *given: nullcontext())
         work(False)
     assert (unfinished_path(out) / ".state").is_dir()
     with pytest.raises(AlreadyFinished):

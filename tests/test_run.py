@@ -178,7 +178,7 @@ def test_progress_in_a_log_is_a_line_now_and_then_and_one_at_the_end(capsys):
         for _ in range(5):
             bar.advance()
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith("Rendering: 1/5, about ") and lines[0].endswith("s left")
+    assert lines[0] == "Rendering: 1/5"
     assert lines[-1].startswith("Rendering: 5 in ") and len(lines) == 6
     with Progress("Rendering", 5) as bar:
         bar.advance(5)
@@ -186,6 +186,30 @@ def test_progress_in_a_log_is_a_line_now_and_then_and_one_at_the_end(capsys):
     with pytest.raises(ValueError), Progress("Rendering", 5):
         raise ValueError
     assert capsys.readouterr().err == ""
+
+
+def lines_of(seconds: list[float], monkeypatch, capsys) -> list[str]:
+    """What is said of steps that take so many seconds."""
+    clock = [0.0]
+    monkeypatch.setattr("lightdepth.reporting.progress.time.monotonic", lambda: clock[0])
+    with Progress("Densifying", len(seconds), interval=0.0) as bar:
+        for taken in seconds:
+            clock[0] += taken
+            bar.advance()
+    lines: list[str] = capsys.readouterr().err.splitlines()
+    return lines
+
+
+def test_a_slow_first_step_does_not_tell_how_long_the_others_take(monkeypatch, capsys):
+    lines = lines_of([50.0, *[2.0] * 34], monkeypatch, capsys)
+    assert lines[0] == "Densifying: 1/35" and lines[1] == "Densifying: 2/35"
+    assert lines[2] == "Densifying: 3/35, about 64 s left" and lines[20] == "Densifying: 21/35, about 28 s left"
+
+
+def test_the_time_left_is_that_of_recent_steps_and_of_no_fraction_of_a_second(monkeypatch, capsys):
+    lines = lines_of([*[0.01] * 20, *[5.0] * 20], monkeypatch, capsys)
+    assert not any("left" in line for line in lines[:20])
+    assert lines[35] == "Densifying: 36/40, about 20 s left"
 
 
 def test_what_is_warned_of_during_a_run_is_shown_and_in_its_log_and_run_json(tmp_path):

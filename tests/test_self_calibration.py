@@ -14,11 +14,12 @@ from test_sfm import pose, render, texture
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole
+from lightdepth.camera.provenance import TOLERATED
 from lightdepth.cli import main
 from lightdepth.datasets import SequenceSource, write_folder
 from lightdepth.files.images import to_bgr8
 from lightdepth.frame import Frame
-from lightdepth.sfm.self_calibration import TOLERATED, SelfCalibration, across, self_calibrated
+from lightdepth.sfm.self_calibration import SelfCalibration, across, self_calibrated
 from lightdepth.tube import lens
 from lightdepth.uncalibrated import FRAMES, stretch
 

@@ -39,7 +39,6 @@ ALLOWED = {
     "lightdepth/sfm/repair.py: repaired_submap": _HIDDEN,
     "lightdepth/sfm/repair.py: _as_it_was": _RUN,
     "lightdepth/sfm/self_calibration.py: self_calibrated": "in a temporary folder that is no output",
-    "lightdepth/uncalibrated.py: write": "import and predict give it the run's folder",
     "lightdepth/uncalibrated.py: found_camera": "in a temporary folder that is no output",
     "densify/commands/bench.py: run": _RUN,
     "densify/commands/bench.py: compare_estimators": _RUN,

@@ -10,6 +10,7 @@ the run is complete.
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ import yaml
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from lightdepth.checkpoint import load_model, save_model
+from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.errors import InputError, Interrupted
 from lightdepth.files.named_inputs import write_inputs
 from lightdepth.files.replacing import output_of, read_record, unfinished_path
@@ -104,6 +106,17 @@ class _Job:
     resume: bool
 
 
+def _set_up(data: FrameDataModule) -> None:
+    """Opens its sequences; what cannot be opened is told with the options of train, which lie below --data."""
+    try:
+        data.setup()
+    except NoCamera as error:
+        raise error.of_other_verb(error.where, "--data.camera", maps=False) from error
+    except InputError as error:
+        cure = re.sub(r"(?<![\w.-])--(camera|light|mask|format|bit-depth)\b", r"--data.\1", error.cure)
+        raise InputError(error.where, error.found, cure) from error
+
+
 def _fitted(
     model: LightDepth,
     data: FrameDataModule,
@@ -113,7 +126,7 @@ def _fitted(
     start: Start | None,
 ) -> dict[str, float]:
     started = time.time()
-    data.setup()
+    _set_up(data)
     asked = {"settings": yaml.safe_load(job.config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
     output = output_of(folder) or folder
     names = Names() if KEPT.get() else names_of(asked, (output, folder), argv=job.arguments)

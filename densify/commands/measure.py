@@ -65,6 +65,8 @@ def measure(
         places = places_in_frame(dense, frame, np.asarray(pixels, float).reshape(-1, 2))
     found = measured(dense, places, radius, mm_per_unit or 1.0)
     result = {"run": told(str(run), run=run), "map": dense.id, "unit": unit, **found.record()}
+    known = dense.camera.provenance
+    result["warnings"] = [known.doubt] if known is not None and known.doubt else []
     print(found.summary(unit))
     if output is not None:
         write_whole(output, json.dumps(plain(result), indent=1) + "\n")

@@ -63,7 +63,8 @@ def sparse(
             looking if left out.
         camera: Calibration file that wins over the folder's own; `auto` finds the camera from the frames' motion.
         fov: Field of view across the image's width, degrees, at which --camera auto (which it implies) starts, and
-            which is assumed where the frames do not connect. A larger one means a shorter focal length.
+            which is assumed where the frames do not connect or their motion hardly tells it. A larger one means a
+            shorter focal length.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
         bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
             their highest values show. A larger one reads the same numbers as darker.

@@ -28,8 +28,8 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 def intrinsics(camera: CameraModel) -> dict[str, object]:
     """A camera of CAMERAS in transforms.json's words."""
-    names = [name for name in vars(camera) if name not in ("width", "height")]
-    numbers = {_INTRINSICS.get(name, name): value for name, value in zip(names, camera.params, strict=True)}
+    values = zip(camera.parameters(), camera.params, strict=True)
+    numbers = {_INTRINSICS.get(name, name): value for name, value in values}
     model = "OPENCV" if camera.name == "PINHOLE" else camera.name
     return {"camera_model": model, "w": camera.width, "h": camera.height, **numbers}
 

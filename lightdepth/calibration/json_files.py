@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from lightdepth.camera import CameraModel, camera_from_params
+from lightdepth.camera import CameraModel, Provenance, camera_from_params
+from lightdepth.camera.provenance import CameraSource
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.files.writing import write_whole
@@ -29,9 +30,9 @@ class _CameraFile(BaseModel):
     height: int
     params: list[float]
     pixel_center: Annotated[float, AfterValidator(_pixel_center)] = 0.5
-    # How it was come by, where it was not calibrated: for whoever opens the file
-    source: Literal["measured", "published", "given", "assumed", "self-calibrated"] | None = None
-    focal_deviation: float | None = None
+    # How it was come by: see Provenance
+    source: CameraSource | None = None
+    focal_deviation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     note: str | None = None
 
 
@@ -50,23 +51,21 @@ def camera_from_fields(data: Any, where: str) -> CameraModel:
     """The camera of camera.json's fields, wherever they are written; `where` names the place in errors."""
     found = checked_fields(_CameraFile, data, where)
     camera = camera_from_params(found.model, found.width, found.height, found.params, where)
-    return camera.with_pixel_center(found.pixel_center)
+    camera = camera.with_pixel_center(found.pixel_center)
+    if found.source is None:
+        return camera
+    return replace(camera, provenance=Provenance(found.source, found.focal_deviation, found.note))
 
 
 def write_camera_json(camera: CameraModel, path: Path) -> None:
-    write_whole(path, json.dumps(_fields_of(camera), indent=1) + "\n")
+    write_whole(path, json.dumps(fields_of(camera), indent=1) + "\n")
 
 
-def write_found_camera(camera: CameraModel, path: Path, source: str, deviation: float | None, note: str) -> None:
-    """camera.json of a camera that nobody calibrated: where it is from, the focal length's standard deviation as a
-    share of it, where known, and a sentence."""
-    told = {} if deviation is None else {"focal_deviation": round(deviation, 5)}
-    write_whole(path, json.dumps({**_fields_of(camera), "source": source, **told, "note": note}, indent=1) + "\n")
-
-
-def _fields_of(camera: CameraModel) -> dict[str, object]:
+def fields_of(camera: CameraModel) -> dict[str, object]:
+    """camera.json's fields, from which `camera_from_fields` makes the camera again."""
     data = {"model": camera.name, "width": camera.width, "height": camera.height, "params": list(camera.params)}
-    return {**data, "pixel_center": 0.5}
+    known = {} if camera.provenance is None else asdict(camera.provenance)
+    return {**data, "pixel_center": 0.5} | {name: value for name, value in known.items() if value is not None}
 
 
 def light_from_text(text: str) -> PhotometricCalibration:

@@ -19,6 +19,7 @@ from lightdepth.camera.fisheye import KannalaBrandt, Scaramuzza
 from lightdepth.camera.model import CameraModel
 from lightdepth.camera.params import CAMERA_MODELS, camera_from_params, camera_of, opencv_camera
 from lightdepth.camera.perspective import Brown, FullBrown, Pinhole
+from lightdepth.camera.provenance import Provenance
 
 __all__ = [
     "CAMERA_MODELS",
@@ -27,6 +28,7 @@ __all__ = [
     "FullBrown",
     "KannalaBrandt",
     "Pinhole",
+    "Provenance",
     "Scaramuzza",
     "camera_from_params",
     "camera_of",

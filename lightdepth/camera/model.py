@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from typing import ClassVar, Self
 
 import numpy as np
 
 from lightdepth.camera.arrays import Array, floating, scaled
+from lightdepth.camera.provenance import Provenance
 from lightdepth.errors import InputError
 
 MAX_THETA = np.pi / 2
@@ -28,6 +29,8 @@ class CameraModel(ABC):
 
     width: int
     height: int
+    provenance: Provenance | None = field(default=None, kw_only=True, compare=False, repr=False)
+    """Where the camera is from, where its file says it: no part of what it is."""
 
     name: ClassVar[str]
 
@@ -38,10 +41,11 @@ class CameraModel(ABC):
         if max(self.width, self.height) > LONGEST_SIDE:
             digits = f"{str(self.width)[:20]}x{str(self.height)[:20]}"
             raise InputError("camera size", digits, f"expected sides of at most {LONGEST_SIDE} pixels")
-        bad = [f.name for f in fields(self) if not np.isfinite(getattr(self, f.name))]
+        numbers = ("width", "height", *self.parameters())
+        bad = [name for name in numbers if not np.isfinite(getattr(self, name))]
         if bad:
             raise InputError(f"{self.name} camera", f"{', '.join(bad)} not finite", "expected numbers")
-        large = [f.name for f in fields(self) if abs(getattr(self, f.name)) > LARGEST]
+        large = [name for name in numbers if abs(getattr(self, name)) > LARGEST]
         if large:
             raise InputError(f"{self.name} camera", f"{', '.join(large)} beyond {LARGEST:g}", "expected pixels")
 
@@ -95,7 +99,12 @@ class CameraModel(ABC):
     @property
     def params(self) -> tuple[float, ...]:
         """Intrinsics in the order of the file formats."""
-        return tuple(getattr(self, f.name) for f in fields(self)[2:])
+        return tuple(getattr(self, name) for name in self.parameters())
+
+    @classmethod
+    def parameters(cls) -> tuple[str, ...]:
+        """Names of the intrinsics, in the order of `params`."""
+        return tuple(f.name for f in fields(cls) if f.name not in ("width", "height", "provenance"))
 
 
 @lru_cache(maxsize=16)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 
 from lightdepth.camera.fisheye import KannalaBrandt, Scaramuzza
 from lightdepth.camera.foreign import (
@@ -110,12 +109,12 @@ def camera_from_params(model: str, width: int, height: int, params: list[float],
         count, build = _OTHERS[model]
     elif model in CAMERA_MODELS:
         cls = CAMERA_MODELS[model]
-        count, build = len(fields(cls)) - 2, lambda w, h, p: cls(w, h, *p)
+        count, build = len(cls.parameters()), lambda w, h, p: cls(w, h, *p)
     else:
         known = ", ".join([*CAMERA_MODELS, *_OTHERS])
         raise InputError(where, f"unknown camera model {model!r}", f"expected one of {known}")
     if len(params) != count:
-        names = f": {' '.join(f.name for f in fields(cls)[2:])}" if model in CAMERA_MODELS else ""
+        names = f": {' '.join(cls.parameters())}" if model in CAMERA_MODELS else ""
         raise InputError(where, f"{len(params)} parameters of {model}", f"expected {count}{names}")
     return camera_of(lambda: build(int(width), int(height), [float(p) for p in params]), where)
 

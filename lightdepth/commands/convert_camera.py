@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -65,6 +66,7 @@ def convert_camera(
             f"{model} in place of {camera.name}: residual {found.median_px:.2g} px (median), {found.max_px:.2g} px "
             f"(largest), over the {100 * found.seen_share:.1f} % of the field that it can represent"
         )
-        camera = found.camera
+        camera = replace(found.camera, provenance=camera.provenance)
     write_camera(camera, output, to)
-    print(f"{said}\n{output}")
+    doubt = "" if camera.provenance is None else camera.provenance.doubt
+    print("\n".join([said, *([f"warning: {doubt}"] if doubt else []), str(output)]))

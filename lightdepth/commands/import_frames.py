@@ -69,8 +69,7 @@ def import_frames(
         paths = [name for name in (*source.files, "overlay_mask") if arguments[name] is not None]
         arguments |= {name: "(name left out)" for name in paths if "=" not in str(arguments[name])}
     with run_folder(output, "import", arguments, overwrite, resume, (source, overlay_mask), keep_names) as run:
-        calibrated, found_camera = with_camera(source, run)
-        opened, files = open_source(calibrated)
+        opened, files = open_source(with_camera(source, run))
         run.check_inputs(**source.files, overlay_mask=overlay_mask)
         if opened.video is not None and choice.rate is None and choice.every is None:
             choice = replace(choice, rate=DEFAULT_RATE)
@@ -93,8 +92,6 @@ def import_frames(
                     " ".join(f"{f.found} {f.cure}" for f in found) or "look at the frames",
                 )
             pictures = write_pictures(run, opened, scan, fate, regions, geometry, shape.deinterlace)
-            if found_camera is not None and geometry.camera is not None:
-                found_camera.write(run.folder / "camera.json", geometry.camera)
         known = facts(opened, scan, fate, regions, geometry, choice, source.data if keep_names else None)
         axis = (scan.times, "time [s]") if np.isfinite(scan.times).all() else (scan.rows, "frame")
         page = import_page(

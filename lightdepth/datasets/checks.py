@@ -58,6 +58,9 @@ def check_sequence(sequence: FrameSequence) -> FrameSequence:
         raise InputError(
             sequence.source, f"frames of {width}x{height}", f"expected at least {_LEAST_SIDE}x{_LEAST_SIDE}"
         )
+    known = frames[0].camera.provenance
+    if known is not None and known.doubt:
+        warnings.warn(known.doubt, stacklevel=3)
     for message in (
         *_camera_doubts(frames[0].camera),
         *_light_doubts(frames[0].light),

@@ -17,6 +17,7 @@ import numpy as np
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.format import Format, checked_images, frames_of
+from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.sequence import (
     FrameSequence,
     legible,
@@ -58,13 +59,7 @@ def read_folder(
             above = path.resolve().parent
             if (above / "camera.json").is_file():
                 raise InputError(path, f"no camera.json, but {above} has one", f"give the sequence's folder, {above}")
-            raise InputError(
-                path,
-                "no camera.json",
-                'give --camera FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), '
-                "--camera auto to find it from the motion (--fov 70 where to start), or, where a verb takes --map, a "
-                "map that has one",
-            )
+            raise NoCamera.at(path, "no camera.json")
         camera = read_camera(path / "camera.json")
         if first is not None:
             check_image_size(str(first), *image_size(first), camera)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from lightdepth.camera import CameraModel
+from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.reading import FormatName, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.errors import InputError
@@ -38,7 +39,8 @@ class SequenceSource:
     files say, else what their highest values show. A larger one reads the same numbers as darker."""
     fov: Annotated[float | None, Range(10, 175)] = None
     """Field of view across the image's width, degrees, at which --camera auto (which it implies) starts, and which is
-    assumed where the frames do not connect. A larger one means a shorter focal length. Left out, several are tried."""
+    assumed where the frames do not connect or their motion hardly tells it. A larger one means a shorter focal length.
+    Left out, several are tried."""
 
     @property
     def asks_for_camera(self) -> bool:
@@ -49,14 +51,18 @@ class SequenceSource:
         return auto or self.fov is not None
 
     def open(self, map_camera: CameraModel | None = None) -> FrameSequence:
-        """The frames; `map_camera` as for open_sequence. Raises InputError where they cannot be read."""
+        """The frames; `map_camera` as for open_sequence. Raises InputError where they cannot be read, NoCamera for
+        verbs that find none."""
         if self.asks_for_camera:
             raise InputError(
                 "--camera auto" if self.fov is None else "--fov",
                 "this verb finds no camera",
                 f"make a sequence with one first: lightdepth import {self.data} --camera auto -o DATA",
             )
-        return open_sequence(self.data, self.format, self.camera, self.light, self.mask, map_camera, self.bit_depth)
+        try:
+            return open_sequence(self.data, self.format, self.camera, self.light, self.mask, map_camera, self.bit_depth)
+        except NoCamera as error:
+            raise error.of_other_verb(self.data) from error
 
     @property
     def files(self) -> dict[str, Path | None]:

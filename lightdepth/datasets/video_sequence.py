@@ -15,6 +15,7 @@ from lightdepth.datasets import endomapper
 from lightdepth.datasets.clip import Clip, check_depth
 from lightdepth.datasets.clip_checks import check_clip
 from lightdepth.datasets.dicom import is_dicom, open_dicom
+from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.sequence import FrameSequence, border_mask, list_images, read_mask, warn_of_border
 from lightdepth.datasets.video import VideoFile
 from lightdepth.datasets.video_calibration import VideoCalibration, found_calibration
@@ -88,13 +89,7 @@ def read_video(
         camera, light = camera or found.camera, light or found.light
         mask = found.mask if mask is None else mask
     if camera is None:
-        raise InputError(
-            path,
-            "no camera.json beside it",
-            'give --camera FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]}), '
-            "--camera auto to find it from the motion (--fov 70 where to start), or, where a verb takes --map, a "
-            "map that has one",
-        )
+        raise NoCamera.at(path, "no camera.json beside it")
     check_turned(video, camera)
     images = spread_pictures(video)
     check_depth(video, images)

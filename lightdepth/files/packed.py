@@ -9,13 +9,13 @@ from __future__ import annotations
 import json
 import types
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from lightdepth.camera import CameraModel, camera_from_params
+from lightdepth.camera import CameraModel, Provenance, camera_from_params
 
 T = TypeVar("T")
 _TREE = "tree"
@@ -47,7 +47,8 @@ def _packed(value: Any, arrays: dict[str, np.ndarray], given: Mapping[type, obje
         arrays[f"array_{len(arrays)}"] = value
         return f"array_{len(arrays) - 1}"
     if isinstance(value, CameraModel):
-        return [value.name, value.width, value.height, *value.params]
+        known = _packed(value.provenance, arrays, given)
+        return [known, value.name, value.width, value.height, *value.params]
     if is_dataclass(value):
         return [_packed(getattr(value, f.name), arrays, given) for f in fields(value)]
     if isinstance(value, Mapping):
@@ -68,8 +69,9 @@ def _unpacked(kind: Any, tree: Any, arrays: Mapping[str, np.ndarray], given: Map
     if kind is np.ndarray:
         return arrays[tree]
     if kind is CameraModel:
-        model, width, height, *params = tree
-        return camera_from_params(model, width, height, params, "the camera")
+        known, model, width, height, *params = tree
+        camera = camera_from_params(model, width, height, params, "the camera")
+        return replace(camera, provenance=_unpacked(Provenance, known, arrays, given))
     if is_dataclass(kind):
         hints = get_type_hints(kind)
         values = zip(fields(kind), tree, strict=True)

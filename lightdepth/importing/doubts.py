@@ -22,6 +22,9 @@ def doubts(
     found = finding.of_camera(
         (source.width, source.height), None if camera is None else (camera.width, camera.height), source.no_camera
     )
+    doubt = "" if camera is None or camera.provenance is None else camera.provenance.doubt
+    if doubt:
+        found.append(Finding(f"{doubt[0].upper()}{doubt[1:]}.", "A calibration of this endoscope is better."))
     if source.light is None:
         found.append(
             Finding(

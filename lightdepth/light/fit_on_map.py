@@ -96,11 +96,16 @@ class LightFit:
         e = self.errors
         if self.bound:
             return f"{self.bound}, so it says nothing"
-        if not e["fitted"] <= GAIN_NEEDED * e["constant"]:
+        gains = e["fitted"] <= GAIN_NEEDED * e["default"]
+        # Where the defaults are plainly worse, a fit that is as good as a constant distance is the better light.
+        if not GAIN_NEEDED * e["fitted"] <= e["constant"] or not (gains or self.beats_constant):
             return f"a constant distance does as well or better ({e['constant']:.1%})"
-        if not e["fitted"] <= GAIN_NEEDED * e["default"]:
-            return f"the default light does as well or better ({e['default']:.1%})"
-        return ""
+        return "" if gains else f"the default light does as well or better ({e['default']:.1%})"
+
+    @property
+    def beats_constant(self) -> bool:
+        """Whether what was withheld is told better by the fitted light than by a constant distance."""
+        return self.errors["fitted"] <= GAIN_NEEDED * self.errors["constant"]
 
     @property
     def better(self) -> bool:
@@ -118,10 +123,20 @@ class LightFit:
             f"defaults, {e['constant']:.1%} with a constant"
         )
         if self.better:
-            return text
+            return text if self.beats_constant else f"{text}; used, though a constant distance does as well here"
         text += f"; not used: {self.refused}; the defaults (gamma 2.2, mu 2.767) are kept"
-        beaten = e["default"] <= GAIN_NEEDED * e["constant"]
-        return text if beaten else f"{text}, which hardly beat a constant distance here"
+        if e["default"] <= GAIN_NEEDED * e["constant"]:
+            return text
+        worse = not GAIN_NEEDED * e["default"] <= e["constant"]
+        return f"{text}, which are {'worse than' if worse else 'about as good as'} a constant distance here"
+
+    @property
+    def advice(self) -> str:
+        """What to do where the light that is left tells no more than a constant distance; empty where it does."""
+        left = self.errors["fitted" if self.better else "default"]
+        if left <= GAIN_NEEDED * self.errors["constant"]:
+            return ""
+        return "give the endoscope's own with --light, where it is known"
 
     @property
     def judges(self) -> str:
@@ -246,6 +261,7 @@ def fit_assumed_light(
         run.record["light_fit"] = light_fit
         return None if kept is None else PhotometricCalibration(**kept)
     start = time.perf_counter()
+    run.log("light: is fitted on the map, and judged on hidden blocks of wall")
     found: dict[str, object] = {"used": False}
     light = None
     try:
@@ -255,7 +271,7 @@ def fit_assumed_light(
     else:
         light = fit.fitted if fit.better else None
         found = {
-            "summary": f"fitted on the map: {fit.summary()}",
+            "summary": "; ".join(filter(None, [f"fitted on the map: {fit.summary()}", fit.advice])),
             "fitted": fit.fitted,
             "uncertainty": fit.uncertainty,
             "errors": fit.errors,

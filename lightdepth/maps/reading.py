@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from lightdepth.calibration.json_files import camera_from_fields
+from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.below import folders_in, given
 from lightdepth.files.reading import reading
+from lightdepth.files.schema import read_json
 from lightdepth.maps.colmap import holds_model, read_submap
 from lightdepth.maps.convention import COLMAP, EXPORTER, Reader
 from lightdepth.maps.endocartoscope import MAPS, read_exported_submap
@@ -23,7 +30,7 @@ from lightdepth.maps.tum import (
     is_trajectory,
     read_tum_map,
 )
-from lightdepth.sparse_map import SparseMap
+from lightdepth.sparse_map import SparseMap, Submap, with_provenance
 
 _ACCEPTED = (
     "expected a COLMAP model (cameras, images, points3D as .txt or .bin), a folder of numbered models "
@@ -43,7 +50,43 @@ def read_map(path: Path | str, reader: Reader = Reader()) -> SparseMap:
     """
     path = Path(path)
     with reading(path, "a map", _ACCEPTED):
-        return _read_map(path, reader)
+        return _with_provenance(_read_map(path, reader), path)
+
+
+def _with_provenance(sparse_map: SparseMap, path: Path) -> SparseMap:
+    """The map with what camera.json says of its camera, where that lies in the map's folder, as `sparse` writes it: a
+    COLMAP model has no place for it."""
+    beside = _camera_beside(path.resolve())
+    if beside is None:
+        return sparse_map
+
+    def known(submap: Submap) -> Submap:
+        own = submap.keyframes[0].camera
+        same = own.provenance is None and own.name == beside.name and _size(own) == _size(beside)
+        if not same or not np.allclose(own.params, beside.params, rtol=1e-6, atol=1e-9):
+            return submap
+        return with_provenance(submap, beside.provenance)
+
+    return replace(sparse_map, submaps=tuple(map(known, sparse_map.submaps)))
+
+
+def _camera_beside(path: Path) -> CameraModel | None:
+    """The camera of camera.json in a map's folder, or in the one that its numbered models are in, where it says where
+    it is from."""
+    places = [path]
+    while places[-1].name == "sparse" or _is_number(places[-1].name):
+        places.append(places[-1].parent)
+    file = next((place / "camera.json" for place in places if (place / "camera.json").is_file()), None)
+    if file is not None:
+        with suppress(InputError):  # nobody asked for this file
+            data = read_json(file)
+            if isinstance(data, dict) and data.get("source") is not None:
+                return camera_from_fields(data, str(file))
+    return None
+
+
+def _size(camera: CameraModel) -> tuple[int, int]:
+    return camera.width, camera.height
 
 
 def _read_map(path: Path, reader: Reader) -> SparseMap:

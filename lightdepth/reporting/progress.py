@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from types import TracebackType
 from typing import Any
+
+_LEAST_SECONDS, _LEAST_STEPS, _LEAST_SHARE = 3.0, 2, 0.05
+"""What an estimate of the time left has to rest on, after the first step."""
 
 
 class Progress:
     """`with Progress("Rendering", 40) as bar: ... bar.advance()`.
 
-    On a terminal a rich bar; elsewhere a line at most every ten seconds, and one at the end, with rate and time left.
+    On a terminal a rich bar; elsewhere a line at most every ten seconds, with the time left by recent steps as soon as
+    these tell it, and one at the end. The first step, in which much is set up and compiled, tells nothing.
     """
 
     def __init__(self, label: str, total: int, interval: float = 10.0):
         self.label, self.total, self.done = label, total, 0
         self._interval = interval
         self._bar: Any = None
+        self._recent: deque[tuple[float, int]] = deque(maxlen=2 + max(5, round(0.3 * total)))  # when, and how many then
 
     def __enter__(self) -> Progress:
         self._start = self._last = time.monotonic()
@@ -35,12 +41,19 @@ class Progress:
     def advance(self, count: int = 1) -> None:
         self.done += count
         now = time.monotonic()
+        self._recent.append((now, self.done))
         if self._bar is not None:
             self._bar.update(self._task, completed=self.done)
         elif now - self._last >= self._interval:
             self._last = now
-            left = (now - self._start) / self.done * (self.total - self.done)
-            print(f"{self.label}: {self.done}/{self.total}, about {left:.0f} s left", file=sys.stderr, flush=True)
+            print(f"{self.label}: {self.done}/{self.total}{self._left()}", file=sys.stderr, flush=True)
+
+    def _left(self) -> str:
+        """The time left, in words; empty where it cannot be told yet."""
+        (since, before), (now, done) = self._recent[0], self._recent[-1]
+        if now - since < _LEAST_SECONDS or done - before < max(_LEAST_STEPS, _LEAST_SHARE * self.total):
+            return ""
+        return f", about {(now - since) / (done - before) * (self.total - done):.0f} s left"
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

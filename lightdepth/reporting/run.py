@@ -142,6 +142,11 @@ class Run:
         self.record["warnings"].append(message)
         self.log(f"warning: {message}")
 
+    def warn_once(self, message: str) -> None:
+        """As warn, unless that was said before."""
+        if message not in self.record["warnings"]:
+            self.warn(message)
+
     def hash_inputs(self, **paths: Path | None) -> None:
         """Notes what files and folders are read, by name; those that are None, or not there, are left out."""
         self.record.setdefault("inputs", {}).update(self._hashed(paths))
@@ -183,9 +188,12 @@ class Run:
             file: TextIO | None = None,
             line: str | None = None,
         ) -> None:
-            shown(message, category, filename, lineno, file, line)
             # A library's deprecations are no news to a user; what a process that was killed heard is heard again.
-            if issubclass(category, UserWarning) and str(message) not in self.record["warnings"]:
+            ours = issubclass(category, UserWarning)
+            if ours and str(message) in self.record["warnings"]:
+                return
+            shown(message, category, filename, lineno, file, line)
+            if ours:
                 self.record["warnings"].append(str(message))
                 self._note(f"warning: {message}")
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from lightdepth.calibration import write_camera
 from lightdepth.frame import Frame
 from lightdepth.reporting.kept import kept
 from lightdepth.reporting.report import number
@@ -15,13 +17,14 @@ from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.keeping import KeptDatabase
 from lightdepth.sfm.reconstruction import SfmMap, sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
-from lightdepth.sparse_map import SparseMap
+from lightdepth.sparse_map import SparseMap, with_provenance
 
 
 def made_sparse(
     run: Run, frames: Sequence[Frame], config: SfmConfig, poses: Mapping[int, np.ndarray] | None = None
 ) -> SparseMap:
-    """A map by pycolmap, written to sparse/ in the run folder; `poses` (4, 4) by frame number, where they are known."""
+    """A map by pycolmap, written to sparse/ in the run folder; `poses` (4, 4) by frame number, where they are known.
+    Of a camera that nobody calibrated, camera.json beside it says so."""
     stages: list[str] = []
 
     def show(stage: str, done: int, count: int) -> None:
@@ -44,4 +47,8 @@ def made_sparse(
         for name, reason in found.failed.items():
             run.log(f"  {name}: {reason}")
     run.record["unregistered"] = found.failed
-    return found
+    camera = frames[0].camera
+    if camera.provenance is None:
+        return found
+    write_camera(camera, run.folder / "camera.json")
+    return replace(found, submaps=tuple(with_provenance(s, camera.provenance) for s in found.submaps))

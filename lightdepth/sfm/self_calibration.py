@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from lightdepth.camera import CameraModel, Pinhole, camera_from_params
+from lightdepth.camera.provenance import TOLERATED, told
 from lightdepth.errors import InputError
 from lightdepth.files.working import working_folder
 from lightdepth.frame import Frame
@@ -32,8 +33,9 @@ from lightdepth.sfm.features import features_and_matches, quiet, write_images
 from lightdepth.sfm.mapping import mapping_options
 from lightdepth.sfm.reconstruction import silent
 
-TOLERATED = 0.03
-"""Error of the focal length, as a share of it: where two deviations exceed it, the motion is said not to tell it."""
+HARDLY = 0.2
+"""Deviation of the focal length, as a share of it, above which a field that was stated is worth more than the motion's,
+unless the motion speaks against it."""
 _PINHOLE, _FISHEYE = "SIMPLE_PINHOLE", "OPENCV_FISHEYE"
 _FIELDS = {_PINHOLE: (55.0, 80.0, 110.0), _FISHEYE: (90.0, 140.0)}  # across the width, degrees
 _CLEARLY = 0.95  # of the pinhole's reprojection error, below which the fisheye is taken
@@ -57,25 +59,40 @@ class SelfCalibration:
     points: int
     from_starts: tuple[float, ...]
     """Focal lengths, pixels, that the starts ended at."""
+    fov: float | None = None
+    """Field across the width, degrees, that was stated."""
 
     @property
     def told(self) -> bool:
         """Whether the motion tells the focal length within what is tolerated."""
-        return 2 * self.deviation <= TOLERATED
+        return told(self.deviation)
 
-    def __str__(self) -> str:
+    @property
+    def leaves_stated_field(self) -> bool:
+        """Whether the motion hardly tells the focal length, and does not speak against the field that was stated: that
+        lies within two deviations, or a deviation is as large as the focal length."""
+        if self.fov is None or self.deviation <= HARDLY:
+            return False
+        model = _PINHOLE if isinstance(self.camera, Pinhole) else _FISHEYE
+        stated = _focal(_params(model, self.camera.width, self.camera.height, self.fov), model)
+        return self.deviation >= 1 or abs(stated / self.camera.focal_length - 1) <= 2 * self.deviation
+
+    @property
+    def found(self) -> str:
+        """The focal length, how surely it is known, and what it means."""
         f, width = self.camera.focal_length, self.camera.width
         half = width / 2 / f
         across = 2 * np.degrees(np.arctan(half) if isinstance(self.camera, Pinhole) else _angle(self.camera))
-        found = (
-            f"self-calibrated from {self.mapped} of {self.frames} frames: {self.camera.name}, focal length {f:.1f} px "
-            f"+- {100 * self.deviation:.1f} % ({across:.0f} degrees across)"
-        )
+        return f"focal length {f:.1f} px +- {100 * self.deviation:.1f} % ({across:.0f} degrees across)"
+
+    def __str__(self) -> str:
+        found = f"self-calibrated from {self.mapped} of {self.frames} frames: {self.camera.name}, {self.found}"
         if self.told:
             return found
+        field = "" if self.fov is not None else ", --fov from the endoscope's data sheet,"
         return (
             f"{found}. The motion does not tell it within {100 * TOLERATED:.0f} %: lengths and shapes may be off as "
-            "much. Give frames with more sideways motion, --fov from the endoscope's data sheet, or a calibration"
+            f"much. Give frames with more sideways motion{field} or a calibration"
         )
 
 
@@ -134,7 +151,14 @@ def self_calibrated(
         progress("calibration", len(starts) + 1, len(starts) + 1)
     camera = camera_from_params(best.model, width, height, best.params)
     return SelfCalibration(
-        camera, deviation, best.error, best.images, len(written.names), best.points, tuple(round(f, 2) for f in ends)
+        camera,
+        deviation,
+        best.error,
+        best.images,
+        len(written.names),
+        best.points,
+        tuple(round(f, 2) for f in ends),
+        fov,
     )
 
 

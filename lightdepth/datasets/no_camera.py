@@ -1,0 +1,30 @@
+"""Frames without a calibration, and what the verb that met them can do about it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Self
+
+from lightdepth.errors import InputError
+
+_FILE = 'FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]})'
+_MAP = "or, where a verb takes --map, a map that has one"
+
+
+class NoCamera(InputError):
+    """Frames have no calibration. Its cure is for whoever calls the reader; verbs say what they take instead."""
+
+    @classmethod
+    def at(cls, path: Path, found: str) -> Self:
+        return cls(path, found, f"give --camera {_FILE}, {_MAP}")
+
+    def of_verb_that_finds_one(self) -> NoCamera:
+        """For verbs that take --camera auto."""
+        auto = "--camera auto to find it from the motion (--fov 70 where to start)"
+        return NoCamera(self.where, self.found, f"give --camera {_FILE}, {auto}, {_MAP}")
+
+    def of_other_verb(self, data: Path | str, option: str = "--camera", maps: bool = True) -> NoCamera:
+        """For verbs that do not: `option` is what their calibration file is given by, `maps` whether they take one."""
+        first = f"make a sequence with one first: lightdepth import {data} --camera auto -o DATA"
+        ways = f"{first}, {_MAP}" if maps else f"or {first}"
+        return NoCamera(self.where, self.found, f"give {option} {_FILE}, {ways}")
