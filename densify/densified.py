@@ -234,7 +234,7 @@ class Densified:
 
 def unsure(share: float, config: DensifyConfig) -> str:
     """What was left out of a surface because it is expected to be wrong, in words."""
-    return f"{share:.0%} of the pixels are left out: each is expected to be off by more than {config.fusion.max_error:g} %"
+    return f"{share:.0%} of the pixels are left out, each expected to be over {config.fusion.max_error:g} % off"
 
 
 def note_recipe(run: Run, config: DensifyConfig) -> None:

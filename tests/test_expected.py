@@ -63,7 +63,7 @@ def test_what_is_expected_to_err_by_more_than_asked_is_left_out_and_the_rest_sta
 
 
 def test_what_is_left_out_is_told_with_the_limit():
-    assert unsure(0.123, DensifyConfig()) == "12% of the pixels are left out: each is expected to be off by more than 12 %"
-    assert unsure(0.0, DensifyConfig(fusion=FusionConfig(max_error=5.5))).endswith("5.5 %")
+    assert unsure(0.123, DensifyConfig()) == "12% of the pixels are left out, each expected to be over 12 % off"
+    assert unsure(0.0, DensifyConfig(fusion=FusionConfig(max_error=5.5))).endswith("5.5 % off")
     with pytest.raises(Exception, match="max_error"):
         FusionConfig(max_error=0.0)
