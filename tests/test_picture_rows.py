@@ -136,7 +136,8 @@ def test_a_picture_beyond_the_white_of_its_sequence_is_refused_by_name(tmp_path,
 def test_training_selecting_and_mapping_take_a_bit_depth(tmp_path, capsys):
     data = rewritten(tmp_path / "d", lambda p: png(np.minimum(as_bits(10)(p), 1000)), ".png")
     for verb in (["select", data], ["sparse", data], ["train", "--data.sequences", f"[{data}]"]):
-        assert "--bit-depth 10" in refusal(capsys, *verb, "-o", tmp_path / "out.txt")
+        option = "--data.bit-depth" if verb[0] == "train" else "--bit-depth"
+        assert f"give {option} 10" in refusal(capsys, *verb, "-o", tmp_path / "out.txt")
 
 
 # ---- kinds
