@@ -14,6 +14,7 @@ from densify.evaluation.records import MapFigures
 from densify.joining import Merged, joined_name
 from densify.pipeline import SubmapResult
 from densify.predictions import SeenKeyframe
+from lightdepth.camera import CameraModel
 from lightdepth.reporting.figures import (
     BAD,
     GOOD,
@@ -122,7 +123,8 @@ def joined_section(page: Report, merged: Merged) -> None:
         page.heading(f"Maps {maps} as one ({joined_name(result)})")
         page.text(f"In the frame of reference and unit of map {next(iter(group))}; fused anew from all keyframes.")
         if len(result.dense.triangles):
-            page.figures(mesh_pictures(result.dense, f"maps {maps}"))
+            for row in mesh_pictures(result.dense, f"maps {maps}"):
+                page.figures(row)
 
 
 def _errors(page: Report, figures: Sequence[MapFigures]) -> None:
@@ -227,33 +229,46 @@ def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:
         page.text(f"Keyframe {a.keyframe} left out: {a.reason}")
     if len(left_out) > 5:
         page.text(f"… and {len(left_out) - 5} more (keyframes.csv)")
-    page.figures(mesh_pictures(dense))
+    for row in mesh_pictures(dense):
+        page.figures(row)
     page.wide_figures(
-        [(_scale_chart(dense), "Scale of each keyframe (bars: sigma, as a share of the median distance)")]
+        [
+            (
+                _scale_chart(dense),
+                "Scale of each keyframe; bars: how far its points scatter",
+            )
+        ]
     )
     page.wide_figures(gallery.pictures[dense.submap.id])
 
 
-def mesh_pictures(dense: DenseMap, name: str = "") -> list[tuple[bytes, str]]:
-    """The surface from outside and from the place of the middle keyframe: in its colours, its shape alone, and by how
+def mesh_pictures(dense: DenseMap, name: str = "") -> list[list[tuple[bytes, str]]]:
+    """The surface from outside, then from the place of the middle keyframe: in its colours, its shape alone, and by how
     well it was seen."""
     name = name or f"map {dense.submap.id}"
     middle = dense.submap.keyframes[len(dense.submap.keyframes) // 2]
-    outside = MeshView.of(dense.vertices, dense.triangles)
-    inside = MeshView.of(dense.vertices, dense.triangles, origin=middle.center, axes=middle.cam_from_map[:3, :3])
-    ways: list[tuple[np.ndarray | None, str]] = [
-        (dense.colors, f"Surface of {name} from outside"),
-        (None, "Its shape without its colour"),
-    ]
+    mesh, axes, focal = (dense.vertices, dense.triangles), middle.cam_from_map[:3, :3], _focal_to_see(middle.camera)
+    inside = MeshView.of(*mesh, origin=middle.center, axes=axes, focal=focal)
+    views = {
+        f"Surface of {name} from outside": MeshView.of(*mesh),
+        f"From keyframe {middle.name}; white is no surface": inside,
+    }
+    ways: list[tuple[np.ndarray | None, str]] = [(dense.colors, ""), (None, "Its shape, without its colour")]
     if dense.weights is not None and dense.confidence is not None:
         weak = np.where(dense.confidence[:, None] < _TRUSTED, DOUBTFUL, SEEN_WEAKLY)
         colors = np.where(seen_well(dense)[:, None], SEEN_WELL, weak)
         ways.append((colors, f"Seen well (green), weakly (orange), or of a confidence below {_TRUSTED} (red)"))
-    pictures = []
-    for colored, text in ways:
-        pictures.append((png(outside.picture(colored)), text))
-        pictures.append((png(inside.picture(colored)), f"… and from keyframe {middle.name}"))
-    return pictures
+    return [[(png(view.picture(c)), text or said) for c, text in ways] for said, view in views.items()]
+
+
+def _focal_to_see(camera: CameraModel) -> float:
+    """The focal length, over the width of a picture of 4 by 3, with which a pinhole shows all that a camera sees, up to
+    some 120 degrees."""
+    rays, valid = camera.rays()
+    ahead = rays[valid & (rays[..., 2] > 0.1)]
+    across, down = np.abs(ahead[:, :2] / ahead[:, 2:]).T
+    wanted = 0.5 / max(np.quantile(across, 0.995), 4 / 3 * np.quantile(down, 0.995)) if len(across) else 0.6
+    return float(np.clip(wanted, 0.28, 1.5))
 
 
 def _scale_chart(dense: DenseMap) -> bytes:
