@@ -194,7 +194,7 @@ def test_select_tells_of_a_run_that_was_stopped(tmp_path, stopping, each_alone):
         chosen(tmp_path / "list.txt")
     assert sorted(p.name for p in tmp_path.glob("*list*")) == [".list.txt.unfinished"]
     stopping(None)
-    with refused("an unfinished run of select is beside it"):
+    with refused("beside it is an unfinished run of select"):
         chosen(tmp_path / "list.txt")
     with refused("not resumed, --no-frames was False and is True"):
         chosen(tmp_path / "list.txt", no_frames=True, resume=True)

@@ -7,12 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lightdepth.errors import InputError
 from lightdepth.files.lock import locked
 from lightdepth.files.replacing import check_ours, discard, unfinished_path
 from lightdepth.files.writing import folders_for
-from lightdepth.reporting.run import Run, kept_or_gone
-from lightdepth.reporting.same import check_same
+from lightdepth.reporting.run import Run, going_on, kept_or_gone
 from lightdepth.reporting.unfinished import begun_with, clean, finished_parts
 
 
@@ -35,17 +33,7 @@ def kept_beside(
     made = unfinished_path(real)
     with folders_for([made]), locked(real):
         check_ours(made, output)
-        begun, parts = begun_with(made), finished_parts(made)
-        if begun is not None and parts and not overwrite:
-            if not resume:
-                cure = f"--overwrite starts anew, and {begun['verb']} --resume goes on"
-                raise InputError(output, f"an unfinished run of {begun['verb']} is beside it", cure)
-            check_same(output, begun, verb, arguments)
-        else:
-            parts = {}
-            discard(made)
-            if resume and not output.exists():
-                print("nothing to resume: starting anew", flush=True)
+        parts = going_on(real, verb, arguments, overwrite, resume, "beside it is an unfinished run")
         run = Run(made, real, verb, arguments, parts)
         with kept_or_gone(run, real, True), run.hearing():
             if parts:

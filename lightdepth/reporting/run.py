@@ -313,18 +313,28 @@ def _checked(
         else:
             choices = "give --overwrite" if resume is None else "give --resume or --overwrite"
             raise InputError(output, "already there and not empty", f"choose another -o, or {choices}")
+    parts = going_on(output, verb, arguments, overwrite, bool(resume), "holds an unfinished run")
+    try_place(output)
+    return parts
+
+
+def going_on(
+    output: Path, verb: str, arguments: Mapping[str, Any], overwrite: bool, resume: bool, found: str
+) -> dict[str, Part]:
+    """The finished parts that a run to `output` goes on from; what none goes on from is removed. Raises InputError,
+    saying what was `found`, where nobody said what is to become of them, or they are of another run."""
+    made = unfinished_path(output)
+    begun, parts = begun_with(made), finished_parts(made)
     if begun is not None and parts and not overwrite:
         if not resume:
             cure = f"--overwrite starts anew, and {begun['verb']} --resume goes on"
-            raise InputError(output, f"holds an unfinished run of {begun['verb']}", cure)
+            raise InputError(output, f"{found} of {begun['verb']}", cure)
         check_same(output, begun, verb, arguments)
-    else:
-        parts = {}
-        discard(made)
-        if resume:
-            print("nothing to resume: starting anew", flush=True)
-    try_place(output)
-    return parts
+        return parts
+    discard(made)
+    if resume and not output.is_file():  # a file that is there may be the finished one
+        print("nothing to resume: starting anew", flush=True)
+    return {}
 
 
 def _begin(run: Run) -> None:
