@@ -10,12 +10,10 @@ import json
 import shutil
 import struct
 import tarfile
-import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,13 +21,16 @@ from typing import Any
 import cv2
 import msgpack
 import numpy as np
+import torch
 import trimesh
 import yaml
 from colons import CAMERA, EXACT, colon, slam
 from dicom_files import write_dicom
 from foreign_lenses import FORMATS as LENSES
 from foreign_lenses import drawn
+from parsers import PARSERS, around, parser
 from PIL import Image
+from safetensors.torch import save
 from scipy.io import savemat
 from videos import write_video
 
@@ -38,6 +39,7 @@ from densify.dense_map import run_record
 from densify.evaluation.depth_files import DepthReading
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import KannalaBrandt, Pinhole, Scaramuzza
+from lightdepth.checkpoint import load_model, save_model
 from lightdepth.datasets import (
     open_sequence,
     write_c3vd,
@@ -59,76 +61,19 @@ from lightdepth.files.meshes import read_cloud, read_mesh
 from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.files.tum import read_tum, write_tum
 from lightdepth.maps import read_map, read_trajectory, write_multimap, write_stella, write_text_model
+from lightdepth.network import DepthNetwork, NetworkConfig, build_network
+from lightdepth.network.pretrained import read_weights
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.prediction import DepthPrediction, read_prediction
 from lightdepth.sparse_map import Submap
 from lightdepth.tube import lens
 from train.frame_lists import read_frame_list
 
+__all__ = ["PARSERS", "text_model"]
+
 FISHEYE = KannalaBrandt(96, 80, 50.0, 50.0, 48.0, 40.0, -0.1, 0.0, 0.0, 0.0)
 SCARAMUZZA = Scaramuzza(96, 80, 48.0, 40.0, 50.0, 0.0, -0.004, 1e-6, 0.0, 1.0, 0.0, 0.0)
 TINY = Pinhole(32, 24, 20.0, 20.0, 16.0, 12.0)
-Files = Mapping[str, bytes]
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Files by their path in a folder, and the one of them that is to be spoilt."""
-
-    files: Files
-    target: str
-
-    @property
-    def content(self) -> bytes:
-        return self.files[self.target]
-
-
-@dataclass(frozen=True)
-class Parser:
-    """How a kind of file is read."""
-
-    name: str
-    read: Callable[[Path], object]
-    """reads the file that was spoilt"""
-    samples: Callable[[], list[Sample]]
-    handed_in: bool = True
-    """whether strangers hand it in: calibrations, maps, archives, pictures, videos"""
-    repaired: Callable[[bytes], bytes] = bytes
-    """what brings checksums in order again, behind which nothing else would be reached"""
-
-
-PARSERS: dict[str, Parser] = {}
-
-
-def parser(name: str, read: Callable[[Path], object], handed_in: bool = True, **more: Any) -> Callable[[Any], Any]:
-    """The function below writes samples into the folder that it is given, and names those to be spoilt."""
-
-    def add(write: Callable[[Path], list[str]]) -> Callable[[Path], list[str]]:
-        @cache
-        def samples() -> list[Sample]:
-            with temporary() as folder:
-                targets = write(folder)
-                files = {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-                return [Sample(files, target) for target in targets]
-
-        PARSERS[name] = Parser(name, read, samples, handed_in, **more)
-        return write
-
-    return add
-
-
-@contextmanager
-def temporary() -> Iterator[Path]:
-    folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def around(depth: int, read: Callable[[Path], object]) -> Callable[[Path], object]:
-    """Reads the folder `depth` steps above the file that was spoilt."""
-    return lambda path: read(path.parents[depth - 1])
 
 
 @cache
@@ -550,6 +495,59 @@ def _(folder: Path) -> list[str]:
     for number, kind in enumerate(kinds):
         write_dicom(folder / f"{number}.dcm", images, kind)
     return [f"{number}.dcm" for number in range(len(kinds))]
+
+
+# ---- weights
+
+
+def _zip_repaired(data: bytes) -> bytes:
+    """With right checksums of what an archive stores as it is, as far as its entries can be told."""
+    fixed, at = bytearray(data), data.find(b"PK\1\2")
+    while 0 <= at <= len(fixed) - 46:
+        (size,), (start,) = struct.unpack_from("<I", fixed, at + 20), struct.unpack_from("<I", fixed, at + 42)
+        if start + 30 <= len(fixed):
+            content = start + 30 + sum(struct.unpack_from("<2H", fixed, start + 26))
+            checksum = struct.pack("<I", zlib.crc32(bytes(fixed[content : content + size])))
+            fixed[at + 16 : at + 20] = fixed[start + 14 : start + 18] = checksum
+        at = data.find(b"PK\1\2", at + 4)
+    return bytes(fixed)
+
+
+@cache
+def network() -> DepthNetwork:
+    return build_network(NetworkConfig(width=1, inputs=("rgb",)))
+
+
+def _loaded(path: Path) -> object:
+    """By its folder where that is a checkpoint, as hubs keep them."""
+    return load_model(path.parent if (path.parent / "config.json").is_file() else path)
+
+
+@parser("checkpoint in safetensors", _loaded)
+def _(folder: Path) -> list[str]:
+    save_model(network(), folder / "a.safetensors", {"rows": 32})
+    (folder / "hub").mkdir()
+    (folder / "hub" / "model.safetensors").write_bytes(save(network().state_dict()))
+    card = {"network": network().config.to_dict(), "card": {"rows": 32}}
+    (folder / "hub" / "config.json").write_text(json.dumps(card))
+    return ["a.safetensors", "hub/model.safetensors", "hub/config.json"]
+
+
+@parser("checkpoint of Lightning", load_model, repaired=_zip_repaired)
+def _(folder: Path) -> list[str]:
+    state = {f"network.{name}": value for name, value in network().state_dict().items()}
+    saved = {"hyper_parameters": {"network": network().config.to_dict(), "rows": 32}, "state_dict": state}
+    torch.save(saved, folder / "a.ckpt")
+    torch.save(saved, folder / "old.ckpt", _use_new_zipfile_serialization=False)
+    return ["a.ckpt", "old.ckpt"]
+
+
+@parser("weights of an encoder", read_weights, repaired=_zip_repaired)
+def _(folder: Path) -> list[str]:
+    some = {name: value for name, value in list(network().state_dict().items())[:8]}
+    torch.save({"state_dict": some}, folder / "a.pth")
+    (folder / "a.safetensors").write_bytes(save(some))
+    return ["a.pth", "a.safetensors"]
 
 
 # ---- what the program wrote itself
