@@ -6,6 +6,8 @@ bytes are many (compression), a header that it is a gigabyte long: each is refus
 
 from __future__ import annotations
 
+import io
+import os
 import struct
 import zipfile
 from collections.abc import Iterator
@@ -20,13 +22,17 @@ from lightdepth.errors import InputError
 MAX_HEADER = 10_000_000
 """Bytes of the JSON that a safetensors file begins with; the largest that are known have a tenth of it."""
 _MAX_OBJECTS = 1_000_000
+_ARCHIVE = b"PK\3\4"
 
 
 def read_pickled(path: Path, expected: str) -> Any:
     """What `torch.save` wrote: tensors and plain values. Raises InputError for anything else, `expected` its cure."""
     check_archive(path, expected)
     try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
+        with _Bounded(path) as file:
+            found = torch.load(file, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
     except Exception as error:  # a damaged or hostile pickle can raise anything; it is never executed
         first = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise InputError(path, f"damaged, or holds more than weights and plain values ({first})", expected) from error
@@ -41,12 +47,29 @@ def read_pickled(path: Path, expected: str) -> Any:
     return found
 
 
+class _Bounded(io.BufferedReader):
+    """A file of which no more is asked for than it has left: memory is given to what is asked for, and a pickle from
+    before 2020 may ask for a name of a gigabyte."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._size = os.stat(path).st_size
+
+    def read(self, size: int | None = -1) -> bytes:
+        """At most `size` bytes, all that are left where it is negative."""
+        if size is None or size < io.DEFAULT_BUFFER_SIZE:
+            return super().read(size)
+        return super().read(min(size, max(0, self._size - self.tell())))
+
+
 def check_archive(path: Path, expected: str) -> None:
     """Raises InputError where the parts of torch's archive would be larger than the file: it stores them as they are.
     Files of before 2020 are no archives, and pass."""
-    if not zipfile.is_zipfile(path):
-        return
     try:
+        with path.open("rb") as file:
+            begins_as_one = file.read(len(_ARCHIVE)) == _ARCHIVE
+        if not begins_as_one and not zipfile.is_zipfile(path):
+            return
         with zipfile.ZipFile(path) as archive:
             parts = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, RuntimeError) as error:
