@@ -116,8 +116,15 @@ class View(Brief):
         return result
 
 
-def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, bending: BendingConfig) -> list[Bend]:
-    """The field of every view. `shared` (n, n) counts the points that two views share (sparse_map.covisibility)."""
+def agree(
+    views: Sequence[View],
+    shared: np.ndarray,
+    config: AgreementConfig,
+    bending: BendingConfig,
+    start: Sequence[Bend] | None = None,
+) -> list[Bend]:
+    """The field of every view. `shared` (n, n) counts the points that two views share (sparse_map.covisibility). The
+    rounds begin at `start`, fields of the same bending, or at one scale each."""
     bends = [unbent(view, bending) for view in views]
     if not config.on:
         return bends
@@ -125,8 +132,9 @@ def agree(views: Sequence[View], shared: np.ndarray, config: AgreementConfig, be
     prior = np.tile(bending.precision, len(views))
     pairs = _pairs(shared, config.neighbours) if config.overlap else []
     places = [_Places(view, bend, config.samples) for view, bend in zip(views, bends, strict=True)]
-    w = np.concatenate([bend.weights for bend in bends])
     most = [inlier_deviation(_residual(*each)) for each in zip(views, bends, places, strict=True)]
+    bends = bends if start is None else list(start)
+    w = np.concatenate([bend.weights for bend in bends])
     for _ in range(config.rounds):
         points = [_point_rows(i, *each, config) for i, each in enumerate(zip(views, bends, places, most, strict=True))]
         rows = points + _overlap_rows(views, bends, places, pairs, config, points)

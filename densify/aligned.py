@@ -79,6 +79,16 @@ def align_together(
     return together
 
 
+def bent_finer(keyframes: Sequence[AlignedKeyframe], shared: np.ndarray, config: MethodConfig) -> dict[str, Bend]:
+    """The bends of keyframes that are aligned together, by name, with the finer grid among their bumps."""
+    rows = [i for i, each in enumerate(keyframes) if each.view is not None and each.bend is not None and each.alone]
+    views = [view for i in rows if (view := keyframes[i].view) is not None]
+    start = [bend.with_finer() for i in rows if (bend := keyframes[i].bend) is not None]
+    finer = config.bending.with_finer()
+    bends = agree(views, shared[np.ix_(rows, rows)], config.agreement, finer, start) if rows else []
+    return {keyframes[i].keyframe.name: bend for i, bend in zip(rows, bends, strict=True)}
+
+
 def uncontradicted_keyframes(
     keyframes: Sequence[AlignedKeyframe], shared: np.ndarray, config: ContradictionConfig
 ) -> list[AlignedKeyframe]:

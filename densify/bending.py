@@ -35,6 +35,10 @@ class BendingConfig:
     grids: Annotated[tuple[int, ...], at_least(2, up_to=64)] = (5,)
     """Number n of smooth bumps across and down the image that make up the bend, n x n of them, at least 2; several
     numbers lay several such grids over each other. More let depth bend in finer detail."""
+    finer: Annotated[int, at_least(0, up_to=64)] = 9
+    """Number n of bumps across and down, n x n, of one more grid, which the bends of a submap get as far as the images
+    speak for what it adds (judge.parallax): a map whose points are right bends depth in finer detail than one whose
+    points err together. 0 leaves it out, and live always does."""
     slope_deviation: Annotated[float, at_least(0)] = 0.25
     """How strongly the factor on distance is expected to change with distance itself (standard deviation, a ratio:
     change of the factor's log per change of the log of predicted distance), besides over the image; a soft limit, 0
@@ -57,6 +61,10 @@ class BendingConfig:
     """Expected size (standard deviation) of each bump of a layer, in log distance (0.1 is 10 %). A larger one lets near
     wall bend more strongly against far wall."""
 
+    def with_finer(self) -> BendingConfig:
+        """The same with the finer grid among the others."""
+        return replace(self, grids=(*self.grids, self.finer), finer=0)
+
     @property
     def precision(self) -> np.ndarray:
         """Prior precision of each weight (m,); 0 for the scale, which has no prior."""
@@ -78,6 +86,12 @@ class Bend(Brief):
     image_size: tuple[int, int]
     log_range: tuple[float, float] = (-np.inf, np.inf)
     """least and largest log predicted distance that points speak for; the slope goes no further"""
+
+    def with_finer(self) -> Bend:
+        """The same field, with the finer grid among its bumps, which adds nothing yet."""
+        before = len(self.weights) - self._in_layers
+        weights = np.insert(self.weights, before, np.zeros(self.config.finer**2))
+        return replace(self, config=self.config.with_finer(), weights=weights)
 
     @property
     def scale(self) -> float:

@@ -18,7 +18,7 @@ from densify.alignment import bent
 from densify.bending import Bend
 from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
-from densify.judging.brake import Kept, Tried, kept
+from densify.judging.brake import Kept, Tried, kept, kept_of_finer
 from densify.judging.columns import Columns, FourWays, Method, hidden_errors, hidden_ratios
 from densify.judging.doubts import Doubts, sigma_at
 from densify.judging.images import Images, Seen
@@ -59,6 +59,29 @@ class Judge:
         """What the images tell of each keyframe's distances, by name; nothing before `braked`."""
         return self._told
 
+    def can_tell(self) -> bool:
+        """Whether the images speak, by which a finer grid is judged."""
+        return self._config.judge.on and bool(self._look())
+
+    def refined(self, keyframes: Sequence[AlignedKeyframe], finer: Mapping[str, Bend]) -> list[AlignedKeyframe]:
+        """The same keyframes, with as much of what a finer grid adds to their bends as the images speak for."""
+        errors = [np.zeros((0, 2))]
+        for k in keyframes:
+            if k.keyframe.name in finer and k.bend is not None:
+                errors.append(self._by_images(k.keyframe.name, k.bend, finer[k.keyframe.name]))
+        share = kept_of_finer(np.concatenate(errors))
+        if share == 0:
+            return list(keyframes)
+        if share >= 0.5:
+            self._method = replace(self._method, bending=self._config.bending.with_finer())
+        return [self._mixed(k, finer[k.keyframe.name], share) if k.keyframe.name in finer else k for k in keyframes]
+
+    def _mixed(self, k: AlignedKeyframe, finer: Bend, share: float) -> AlignedKeyframe:
+        assert k.bend is not None and k.alone is not None and k.view is not None
+        coarse = k.bend.with_finer()
+        mixed = replace(coarse, weights=coarse.weights + share * (finer.weights - coarse.weights))
+        return replace(k, bend=mixed, alignment=bent(k.alone, mixed, k.view.observed, self._config.alignment))
+
     def braked(self, keyframes: Sequence[AlignedKeyframe]) -> list[AlignedKeyframe]:
         """The same keyframes, each with as much of its bend as makes things better, and the reason for less."""
         self._ask(keyframes)
@@ -70,11 +93,17 @@ class Judge:
         """Hides blocks of wall, and measures between the images; once."""
         if self._ratios or not self._config.judge.on:
             return
-        self._told = self._images.measure(self._submap)
+        self._look()
         for k in keyframes:
             if k.view is not None and len(k.view.observed):
                 fold = self._fold[self._submap.rows_of(k.view.observed.point_ids)[0]]
                 self._ratios[k.keyframe.name] = hidden_ratios(k.view, fold, self._method)
+
+    def _look(self) -> dict[str, Seen]:
+        """Measures between the images; once."""
+        if not self._told:
+            self._told = self._images.measure(self._submap)
+        return self._told
 
     def judgement(self, dense: DenseMap, keyframes: Sequence[AlignedKeyframe]) -> Judgement | None:
         """What is known of the surface; None where the judge is switched off."""
@@ -142,15 +171,22 @@ class Judge:
         return result
 
     def _tried(self, k: AlignedKeyframe) -> Tried:
-        bend, alone, told = k.alignment.bend, k.alone, self._told.get(k.keyframe.name)
-        assert bend is not None and alone is not None
-        by_images = np.zeros((0, 2))
-        if told is not None and len(told.deciding):
-            o = told.deciding
-            factors = np.stack([np.full(len(o), np.log(alone.scale)), bend.at(o.pixels, o.predicted)], 1)
-            by_images = factors + np.log(o.predicted / o.mapped)[:, None]
+        bend, alone = k.alignment.bend, k.alone
+        assert bend is not None and alone is not None and k.view is not None
+        level = unbent(replace(k.view, scale=alone.scale), self._config.bending)
+        by_images = self._by_images(k.keyframe.name, level, bend)
         blocks = np.abs(self._ratios.get(k.keyframe.name, np.zeros((0, 4))) - 1)
         return Tried(by_images, blocks[:, :2], _size(bend))
+
+    def _by_images(self, name: str, *bends: Bend) -> np.ndarray:
+        """Errors (n, b) of a keyframe's bends in log distance, by the distances that decide."""
+        told = self._told.get(name)
+        if told is None or not len(told.deciding):
+            return np.zeros((0, len(bends)))
+        o = told.deciding
+        log_predicted = np.stack([b.at(o.pixels, o.predicted) for b in bends], 1) + np.log(o.predicted)[:, None]
+        result: np.ndarray = log_predicted - np.log(o.mapped)[:, None]
+        return result
 
     def _lessened(self, k: AlignedKeyframe) -> AlignedKeyframe:
         """With the share of its bend that it keeps, or one scale where points distrust even that."""

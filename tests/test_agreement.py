@@ -147,3 +147,14 @@ def test_nearly_half_of_the_points_being_wrong_and_too_far_does_not_pull_the_sca
     views, predictions = erring(points, 0.45, 0.2)
     bends = agree(views, scene(0.45)[3], AgreementConfig(), BendingConfig())
     assert np.mean(errors(bends, predictions, 0.45)) < at_most
+
+
+def test_a_fit_that_begins_at_another_one_ends_where_it_would_have_ended():
+    predictions = [tilted(f) for f in scene()[0]]
+    views, shared = views_of(predictions), scene()[3]
+    config, coarse = AgreementConfig(rounds=12, tolerance=1e-5), BendingConfig()
+    finer = coarse.with_finer()
+    start = [bend.with_finer() for bend in agree(views, shared, config, coarse)]
+    afresh, on = (agree(views, shared, config, finer, s) for s in (None, start))
+    for a, b in zip(afresh, on, strict=True):
+        assert b.weights == pytest.approx(a.weights, abs=2e-3)

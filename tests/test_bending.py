@@ -119,3 +119,12 @@ def test_near_and_far_wall_in_one_part_of_the_image_bend_apart():
     bend = Bend(config, np.log(30.0), weights, SIZE)
     assert bend.at(corner, np.array([near]))[0] > 0.05 > 0.0 > bend.at(other, np.array([near]))[0]
     assert abs(bend.at(corner, np.array([far]))[0]) < 1e-3
+
+
+@pytest.mark.parametrize("layers", [0, 3])
+def test_a_finer_grid_adds_nothing_before_it_is_fitted(layers):
+    bend = some_bend(BendingConfig(layers=layers, finer=7))
+    finer, log = bend.with_finer(), np.log(prediction().distance)
+    assert finer.config.grids == (5, 7) and len(finer.weights) == len(finer.config.precision)
+    np.testing.assert_allclose(finer.field(log), bend.field(log), rtol=1e-12)
+    assert finer.scale == bend.scale

@@ -12,7 +12,7 @@ from densify.dense_map import DenseMap
 from densify.densified import Densified
 from densify.fusion.volume import FusionConfig
 from densify.judgement import Judge
-from densify.judging.brake import Tried, kept
+from densify.judging.brake import Tried, kept, kept_of_finer
 from densify.judging.columns import Columns
 from densify.judging.config import JudgeConfig
 from densify.judging.verdict import Judgement, Verdict, proposal, worst
@@ -23,7 +23,7 @@ from lightdepth.camera import Pinhole
 from lightdepth.parallax import ParallaxConfig
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Submap
-from tests.colons import colon, sequence, slam, truth
+from tests.colons import EXACT, colon, sequence, slam, truth
 from tests.raising import refused
 
 COARSE = DensifyConfig(fusion=FusionConfig(voxels_per_distance=15.0))
@@ -151,6 +151,41 @@ def test_a_keyframe_keeps_what_the_images_speak_for_of_its_bend(share):
     found = kept({"a": Tried(speaking_for(share), NONE, 0.5)})["a"]
     assert found.share == pytest.approx(share, abs=0.11)
     assert (found.reason == "") == (found.share == 1) and ("too little" in found.reason) == (found.share == 0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_submap_keeps_of_a_finer_grid_what_the_images_speak_for(share):
+    assert kept_of_finer(speaking_for(share, size=0.03)) == pytest.approx(share, abs=0.21)
+    assert kept_of_finer(speaking_for(share, 30)) == 0  # too few
+    assert kept_of_finer(speaking_for(share, size=1e-4, noise=0.3)) == 0  # too unsure
+
+
+def test_depth_is_bent_in_finer_detail_where_the_images_speak_for_it(submap, frames):
+    """Depth that is wrong by a ripple four waves wide, which five bumps cannot follow, and points enough to tell."""
+
+    def rippled(frame) -> DepthPrediction:
+        right = truth(frame)
+        height, width = right.distance.shape
+        wave = np.outer(*(np.sin(8 * np.pi * np.arange(n) / n) for n in (height, width)))
+        return replace(right, distance=right.distance * np.exp(0.15 * wave).astype(np.float32))
+
+    def bent(submap, config) -> tuple[set[tuple[int, ...]], float]:
+        """The grids of the bends, and the median error of the depth that they give."""
+        alignments = judged(submap, frames, rippled, config)[1].dense.alignments
+        bends = {k.number: a.bend for k, a in zip(submap.keyframes, alignments, strict=True) if a.bend is not None}
+        ratios = [
+            np.log(bend.applied(rippled(frames[n])).distance / truth(frames[n]).distance) for n, bend in bends.items()
+        ]
+        errors = np.concatenate([np.abs(r - np.median(r)).ravel() for r in ratios])
+        return {grids for bend in bends.values() if (grids := bend.config.grids)}, float(np.median(errors))
+
+    exact = slam(frames, config=EXACT, points_per_keyframe=400).map.submaps[0]
+    coarse = replace(COARSE, bending=replace(COARSE.bending, finer=0))
+    (fine, error), (five, before) = (bent(exact, c) for c in (COARSE, coarse))
+    assert fine == {(5, 9)} and five == {(5,)} and error < 0.85 * before
+    silent = replace(COARSE, judge=JudgeConfig(parallax=ParallaxConfig(on=False)))
+    assert bent(exact, silent)[0] == {(5,)}
+    assert bent(submap, COARSE)[0] == {(5,)}  # its points are few, and err
 
 
 def test_a_keyframe_with_few_distances_keeps_about_what_its_submap_keeps():

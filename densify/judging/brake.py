@@ -10,6 +10,9 @@ by iterated reweighting. Its variance counts a distance for a quarter, as neighb
 seen s is expected to be 1, give or take .5. A keyframe's own share is expected to be its submap's, give or take .1.
 Where s is below .3 the bend is undone, as what is left of it is wrong as likely as right; from .85 on all of it stays.
 
+What a finer grid of bumps adds to the bends of a submap is held against the same distances, all keyframes together:
+where a map's points are right it is right, where neighbours err together it follows their errors.
+
 Where the images are silent, or leave s as unsure as it was, blocks of wall that were hidden from the bend decide
 between all of it and none. It must then be better by some, and no larger than its prior lets expect, since blocks
 beside the hidden ones may share their error.
@@ -51,6 +54,16 @@ class Kept:
 
     share: float
     reason: str = ""
+
+
+def kept_of_finer(by_images: np.ndarray) -> float:
+    """The share that a submap keeps of what a finer grid adds to its bends, by errors (n, 2) in log distance by the
+    images without it and with it; 0 where they cannot tell."""
+    errors = by_images[np.isfinite(by_images).all(1)]
+    if len(errors) < _LEAST:
+        return 0.0
+    own = _slope(errors, _USUAL)
+    return _rounded(own.value) if own.variance < _SPREAD**2 else 0.0
 
 
 def kept(tried: Mapping[str, Tried]) -> dict[str, Kept]:
@@ -99,11 +112,15 @@ def _slope(errors: np.ndarray, value: float) -> _Share:
 def _by_images(errors: np.ndarray, level: _Share) -> Kept:
     expected = _Share(level.value, level.variance + _APART**2)
     found = _slope(errors, level.value).seen_from(expected).value
-    share = 0.0 if found < _NONE_BELOW else 1.0 if found >= _ALL_FROM else round(found, 1)
+    share = _rounded(found)
     if share == 1:
         return Kept(1.0)
     wrong = f"the images speak for {max(found, 0):.0%} of the bend to the map's points"
     return Kept(share, wrong if share else f"{wrong}, too little to tell it from none")
+
+
+def _rounded(share: float) -> float:
+    return 0.0 if share < _NONE_BELOW else 1.0 if share >= _ALL_FROM else round(share, 1)
 
 
 def _by_blocks(none: float, every: float, size: float) -> Kept:
