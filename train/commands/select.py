@@ -24,7 +24,7 @@ from lightdepth.datasets.with_map import open_with_map
 from lightdepth.errors import AlreadyFinished, InputError
 from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import Content, write_together
-from lightdepth.foreign_text import for_table, for_terminal
+from lightdepth.foreign_text import for_line, for_table
 from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
 from lightdepth.ranges import Range, checked
@@ -164,7 +164,7 @@ def select(
         write_together(writers)
         if no_frames:
             paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
-    print(for_terminal(f"{summary}\n{', '.join(str(path) for path in writers)}"))
+    print(f"{summary}\n{for_line(', '.join(str(path) for path in writers))}")
 
 
 @dataclass(frozen=True)
