@@ -168,6 +168,11 @@ def _failed(verb: str, error: Exception) -> int:
     if failure is not None:
         _say(f"lightdepth {verb}: {failure}")
         return 5
+    if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop from "):  # Path.resolve, until 3.12
+        _say(
+            f"lightdepth {verb}: {str(error).removeprefix('Symlink loop from ')}: links in a circle; give another path"
+        )
+        return 3
     if not isinstance(error, OSError) or error.filename is None or isinstance(error.filename, int):
         raise error
     _say(f"lightdepth {verb}: {os.fsdecode(error.filename)}: {error.strerror or error}")
