@@ -206,6 +206,40 @@ def test_select_tells_of_a_run_that_was_stopped(tmp_path, stopping, each_alone):
         chosen(tmp_path / "other.txt")
 
 
+def test_a_finished_selection_is_known_again_by_what_it_was_made_of(tmp_path):
+    write_folder(colon(0, 4).frames, tmp_path / "data")
+    whole = partial(select, sift_nodes=ALL_ARE_KEPT)
+    again = partial(whole, resume=True)
+    whole(tmp_path / "data", tmp_path / "list.txt")
+    (tmp_path / "elsewhere").symlink_to(tmp_path / "data")
+    for same in ("data", "elsewhere"):
+        with pytest.raises(AlreadyFinished):
+            again(tmp_path / same, tmp_path / "list.txt")
+    for other in ({"with_folder": True}, {"no_frames": True}, {"bit_depth": 9}):
+        with refused("other frames or settings"):
+            again(tmp_path / "data", tmp_path / "list.txt", **other)
+    text = (tmp_path / "list.txt").read_text()
+    (tmp_path / "list.txt").write_text(text[: text.rindex("\n", 0, -1) + 1])
+    with refused("was changed since"):
+        again(tmp_path / "data", tmp_path / "list.txt")
+    (tmp_path / "list.txt").write_text(text)
+    (tmp_path / "list.csv").unlink()
+    with refused("list.csv beside it is gone"):
+        again(tmp_path / "data", tmp_path / "list.txt")
+    (tmp_path / "list.csv").write_text("")
+    first = min((tmp_path / "data" / "frames").iterdir())
+    first.write_bytes(max((tmp_path / "data" / "frames").iterdir()).read_bytes())
+    with refused("other frames or settings"):
+        again(tmp_path / "data", tmp_path / "list.txt")
+
+
+def test_a_list_whose_hidden_neighbours_could_not_be_called_after_it_is_refused(tmp_path):
+    write_folder(colon(0, 4).frames, tmp_path / "data")
+    with refused("241 bytes"):
+        select(tmp_path / "data", tmp_path / ("x" * 237 + ".txt"))
+    assert [p.name for p in tmp_path.iterdir()] == ["data"]
+
+
 class Summed:
     """A view that draws nothing but the sum of its arrays, which tells as well whether they are the same."""
 

@@ -36,7 +36,7 @@ from lightdepth.files.writing import folders_for, sync_below, usual_mode
 from lightdepth.foreign_text import for_line, for_terminal
 from lightdepth.reporting.names import KEPT, Names, names_of, spoken
 from lightdepth.reporting.record import write_run_json
-from lightdepth.reporting.same import check_finished, check_same, compared, own_version
+from lightdepth.reporting.same import check_finished, check_same, compared, fingerprint, own_version
 from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
 from lightdepth.reporting.same import plain as plain
@@ -155,10 +155,13 @@ class Run:
         self.record.setdefault("inputs", {}).update(self._hashed(paths))
         self._note_inputs(self.record["inputs"])
 
-    def check_inputs(self, **paths: Path | None) -> None:
-        """As hash_inputs, for a verb that does not tell the names of files: run.json says nothing of them."""
+    def check_inputs(self, **paths: Path | None) -> str:
+        """As hash_inputs, for a verb that does not tell the names of files: run.json says nothing of them. Returns the
+        `fingerprint` of the run."""
         # By no name of an argument: the arguments of such a verb have no paths.
-        self._note_inputs(self._hashed({f"the {name}": path for name, path in paths.items()}))
+        found = self._hashed({f"the {name}": path for name, path in paths.items()})
+        self._note_inputs(found)
+        return fingerprint(self._verb, self._given, found)
 
     def _hashed(self, paths: Mapping[str, Path | None]) -> dict[str, dict[str, str]]:
         found = {}

@@ -67,6 +67,20 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
             raise InputError(output, f"not resumed, {name} has changed since", "--overwrite starts anew")
 
 
+def fingerprint(verb: str, arguments: Mapping[str, Any], inputs: Mapping[str, Mapping[str, str]]) -> str:
+    """Sixteen digits that are the same for runs of one version with the same options on inputs of the same contents,
+    whatever these are called. `inputs` have the path and the SHA-256 of each."""
+    hashes = {known["path"]: known["sha256"] for known in inputs.values()}
+
+    def by_contents(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: by_contents(each) for name, each in value.items()}
+        return hashes.get(value, value) if isinstance(value, str) else value
+
+    said = json.dumps([own_version(), verb, by_contents(compared(arguments))])
+    return hashlib.sha256(said.encode()).hexdigest()[:16]
+
+
 def own_version() -> str:
     """The version of the program: another one may make other files of the same inputs."""
     try:
