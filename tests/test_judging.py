@@ -12,7 +12,7 @@ from densify.dense_map import DenseMap
 from densify.densified import Densified
 from densify.fusion.volume import FusionConfig
 from densify.judgement import Judge
-from densify.judging.brake import Tried, kept
+from densify.judging.brake import Kept, Tried, kept
 from densify.judging.columns import Columns
 from densify.judging.config import JudgeConfig
 from densify.judging.verdict import Judgement, Verdict, proposal, worst
@@ -103,6 +103,33 @@ def test_white_frames_are_never_green(submap, frames):
     judgement, _ = judged(submap, white, truth)
     assert judgement.images.count == 0 and judgement.surface is None
     assert judgement.verdict.colour != "green" and "too little texture" in judgement.verdict.sentence
+
+
+def test_images_that_were_not_asked_are_not_said_to_have_too_little_texture(submap, frames):
+    config = replace(COARSE, judge=JudgeConfig(parallax=ParallaxConfig(on=False)))
+    judgement = densify_submap(submap, sequence(frames), truth, config).judgement
+    assert judgement is not None and judgement.verdict.colour == "amber"
+    assert "were not asked" in judgement.verdict.sentence and "texture" not in judgement.verdict.sentence
+
+
+def test_a_part_of_a_bend_that_its_points_do_not_trust_counts_as_undone(submap, frames, monkeypatch):
+    monkeypatch.setattr("densify.judgement.kept", lambda tried: dict.fromkeys(tried, Kept(0.5, "half")))
+    assert judged(submap, frames)[0].lessened > 3
+    monkeypatch.setattr("densify.judgement.bent", lambda alone, *_: alone)
+    judgement, result = judged(submap, frames)
+    aligned = [a for a in result.dense.alignments if a.ok]
+    assert (judgement.undone, judgement.lessened) == (len(aligned), 0)
+    assert all(a.bend is None and "trust no such part" in a.unbent_because for a in aligned)
+
+
+def test_bends_of_keyframes_that_are_not_in_the_surface_are_not_counted(submap, frames, monkeypatch):
+    monkeypatch.setattr("densify.judgement.kept", lambda tried: dict.fromkeys(tried, Kept(0.0, "none")))
+    monkeypatch.setattr(
+        "densify.pipeline.uncontradicted_keyframes",
+        lambda keyframes, *_: [k.unread("gone") for k in keyframes[:2]] + list(keyframes[2:]),
+    )
+    judgement, result = judged(submap, frames)
+    assert judgement.undone == judgement.aligned == sum(bool(a.unbent_because) for a in result.dense.alignments)
 
 
 def test_the_surface_uses_every_point(submap, frames):
