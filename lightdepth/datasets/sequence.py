@@ -89,9 +89,15 @@ class FrameSequence(Sequence[Frame]):
             return self
         return FrameSequence(self.names, self._load_blind, self.source, self.sampled)
 
+    def first(self) -> Frame:
+        """The first frame that can be read, for what all have in common. Raises InputError, the very first one's, where
+        none of the first hundred can."""
+        found = next((frame for i in range(min(len(self), 100)) for frame in readable(self, [i])), None)
+        return self[0] if found is None else found
+
     def image_size(self) -> tuple[int, int]:
-        """Width and height of the frames; reads the first."""
-        first = self[0]
+        """Width and height of the frames."""
+        first = self.first()
         return first.camera.width, first.camera.height
 
     def by_number(self, number: int) -> Frame | None:
