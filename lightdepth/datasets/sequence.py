@@ -21,6 +21,7 @@ from lightdepth.files.images import ARRAY_SUFFIXES, PICTURE_SUFFIXES, image_size
 from lightdepth.files.masks import read_two_parts
 from lightdepth.files.reading import reading
 from lightdepth.frame import Frame, frame_number
+from lightdepth.option_names import option
 from lightdepth.sparse_map import Keyframe
 
 IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, *ARRAY_SUFFIXES)
@@ -240,8 +241,8 @@ def warn_of_orientation(source: Path, images: Sequence[Path]) -> None:
 def warn_of_border(source: Path, mask: np.ndarray) -> None:
     """Says that a black border was found, and left out."""
     warnings.warn(
-        f"{source}: {1 - float(mask.mean()):.0%} of the image is a black border, which is left out; give --mask to "
-        "choose another",
+        f"{source}: {1 - float(mask.mean()):.0%} of the image is a black border, which is left out; give "
+        f"{option('mask')} to choose another",
         stacklevel=6,
     )
 
