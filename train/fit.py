@@ -123,7 +123,7 @@ def _fitted(
     job: _Job,
     start: Start | None,
 ) -> dict[str, float]:
-    started = time.time()
+    started = time.monotonic()
     _set_up(data)
     asked = {"settings": yaml.safe_load(job.config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
     output = output_of(folder) or folder

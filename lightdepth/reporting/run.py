@@ -70,7 +70,7 @@ class Run:
         self.resumed = bool(parts)
         self._told: set[str] = set()  # finished parts whose reports are in the record
         self._begun: dict[str, tuple[int, int]] = {}  # failures and warnings when a part began: parts may lie in parts
-        self._verb, self._given, self._start = verb, arguments, time.time()
+        self._verb, self._given, self._start = verb, arguments, time.monotonic()
         self._arguments = plain(arguments)
         self.keep_names = False
         self._say: Callable[[str], str] | None = None
