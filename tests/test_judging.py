@@ -236,6 +236,13 @@ def test_the_verdict_has_a_colour_and_a_reason_with_figures(colour, sentence, ch
     assert verdict.colour == colour and sentence in verdict.sentence, verdict
 
 
+def test_a_verdict_says_nothing_twice():
+    for surface in (None, Withheld(20, 0.2, 0.3, 0.0, 0.2)):
+        for off in (0.08, 0.2):
+            said = known(surface=surface, hidden=Withheld(500, off, 0.3, 0.0, off)).verdict.sentence
+            assert said.count("hidden blocks") == said.count("the images") == 1, said
+
+
 def test_a_better_map_is_proposed_where_the_images_speak_against_it_and_only_there():
     bad, against = Columns(500, 0.07, 0.06, 0.1, 0.1), Columns(500, 0.03, 0.04, 0.1, 0.1)
     good, near, far = Columns(500, 0.03, 0.03, 0.1, 0.1), *(Withheld(500, m, 0.1, 0.0, m) for m in (0.02, 0.08))

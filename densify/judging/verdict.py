@@ -173,9 +173,8 @@ def _verdict(j: Judgement) -> Verdict:
     else:
         silent = "the images have too little texture or parallax to judge by"
         said = silent if j.asked else "the images were not asked (--judge.parallax.on false)"
-        red, amber = [], [f"{said}; hidden blocks of the map's wall are {_share(number)} off"]
-        if not number <= RED:
-            red.append(f"hidden blocks of the map's wall are {_share(number)} off, and the images say nothing")
+        hidden = f"hidden blocks of the map's wall are {_share(number)} off"
+        red, amber = ([], [f"{said}; {hidden}"]) if number <= RED else ([f"{hidden}, and {said}"], [])
     amber += _few(j.keyframes, j.aligned)
     light = j.images if j.images.count >= _LEAST else j.blocks
     remarks = []
