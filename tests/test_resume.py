@@ -196,6 +196,8 @@ def test_select_tells_of_a_run_that_was_stopped(tmp_path, stopping, each_alone):
     stopping(None)
     with refused("beside it is an unfinished run of select"):
         chosen(tmp_path / "list.txt")
+    with refused("not resumed, --sift-nodes.min-spread was 0.0 and is 0.1"):
+        chosen(tmp_path / "list.txt", sift_nodes=replace(ALL_ARE_KEPT, min_spread=0.1), resume=True)
     with refused("not resumed, --no-frames was False and is True"):
         chosen(tmp_path / "list.txt", no_frames=True, resume=True)
     chosen(tmp_path / "list.txt", overwrite=True)
