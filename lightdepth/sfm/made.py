@@ -47,7 +47,7 @@ def made_sparse(
         for name, reason in found.failed.items():
             run.log(f"  {name}: {reason}")
     run.record["unregistered"] = found.failed
-    camera = frames.first().camera
+    camera = frames[0].camera
     if camera.provenance is None:
         return found
     write_camera(camera, run.folder / "camera.json")
