@@ -235,6 +235,19 @@ def test_a_finished_selection_is_known_again_by_what_it_was_made_of(tmp_path):
         again(tmp_path / "data", tmp_path / "list.txt")
 
 
+def test_what_came_to_stand_beside_a_list_meanwhile_is_not_replaced(tmp_path, monkeypatch):
+    write_folder(colon(0, 4).frames, tmp_path / "data")
+
+    def beside(*_) -> bytes:
+        select(tmp_path / "data", tmp_path / "list.md", sift_nodes=ALL_ARE_KEPT, no_frames=True)
+        return b""
+
+    monkeypatch.setattr("train.commands.select._sheet", beside)
+    with refused("list.csv", "already there"):
+        select(tmp_path / "data", tmp_path / "list.txt", sift_nodes=ALL_ARE_KEPT)
+    assert sorted(p.name for p in tmp_path.glob("*list*")) == ["list.csv", "list.html", "list.md"]
+
+
 def test_a_list_whose_hidden_neighbours_could_not_be_called_after_it_is_refused(tmp_path):
     write_folder(colon(0, 4).frames, tmp_path / "data")
     with refused("241 bytes"):

@@ -124,7 +124,8 @@ def select(
         raise InputError("--resume, --overwrite", "they contradict each other", "give one of them")
     paths, going_on = _paths(output), resume and goes_on(output)
     # A run that goes on may have been begun by --overwrite; one that is finished is looked at before it is refused.
-    check_files(paths.values(), overwrite or going_on or (resume and output.is_file()), [data, map, camera, mask])
+    replacing = overwrite or going_on or (resume and output.is_file())
+    check_files(paths.values(), replacing, [data, map, camera, mask])
     if output.resolve().parent == data.resolve() and not no_frames and any(c.isdigit() for c in output.stem):
         found = f"{paths['sheet'].name}, among the frames, would be taken for one: it has a number"
         raise InputError("-o", found, "choose a name without digits, another folder, or --no-frames")
@@ -162,6 +163,7 @@ def select(
         }
         if picture is not None:
             writers = {paths["sheet"]: picture, **writers}
+        check_files(writers, replacing)  # a run to list.md writes list.csv too
         write_together(writers)
         if no_frames:
             paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
