@@ -112,7 +112,7 @@ class Densified:
 
     def notes(self, of: str, frames: FrameSequence, light_fit: Mapping[str, object] | None) -> list[str]:
         """Sentences for the page: what the surfaces were made of (`of`), under which light, and what is weak."""
-        light = frames[0].light
+        light = frames.first().light
         under = f"gamma {light.gamma:.3g}, mu {light.mu:.3g} ({light.source})"
         notes = [f"Verdict: {self.verdict}."] if self.verdict is not None else []
         notes += [f"{of}; depth by {self.model}; light of the frames: {under}."]

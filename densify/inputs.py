@@ -95,7 +95,7 @@ def map_and_frames(
     check_shared_frames(sparse_map, frames)
     _say_localised(run, sparse_map, frames)
     width, height = frames.image_size()
-    given = frames[0].camera if source.camera is not None else None
+    given = frames.first().camera if source.camera is not None else None
     if (map_camera.width, map_camera.height) != (width, height):
         run.log(f"map made at {map_camera.width}x{map_camera.height}, rescaled to the frames' {width}x{height}")
     fitted = fitted_to_frames(sparse_map, width, height, given)  # first: a cropped image is refused by its size

@@ -89,6 +89,11 @@ class Judge:
         self._kept = kept(tried) if self._config.judge.on else {}
         return [self._lessened(k) if k.keyframe.name in self._kept else k for k in keyframes]
 
+    def _shares(self, keyframes: Sequence[AlignedKeyframe]) -> list[float]:
+        """What is kept of their bends, of those keyframes that the surface is made of."""
+        names = (k.keyframe.name for k in keyframes if k.alignment.ok)
+        return [self._kept[name].share for name in names if name in self._kept]
+
     def _ask(self, keyframes: Sequence[AlignedKeyframe]) -> None:
         """Hides blocks of wall, and measures between the images; once."""
         if self._ratios or not self._config.judge.on:
@@ -125,6 +130,7 @@ class Judge:
         points = [(k.keyframe, self._told[k.keyframe.name].judging) for k in keyframes if k.keyframe.name in self._told]
         sizes = [_size(k.alignment.bend) for k in keyframes if k.alignment.bend]
         blocks = [np.abs(ratios - 1) for ratios in self._ratios.values()]
+        shares = self._shares(keyframes)
         return Judgement(
             blocks=Columns.of(blocks),
             drawn=Columns.of(drawn),
@@ -134,10 +140,11 @@ class Judge:
             surface=Withheld.of(dense, points),
             keyframes=len(keyframes),
             aligned=sum(k.alignment.ok for k in keyframes),
-            undone=sum(kept.share == 0 for kept in self._kept.values()),
-            lessened=sum(0 < kept.share < 1 for kept in self._kept.values()),
+            undone=sum(share == 0 for share in shares),
+            lessened=sum(0 < share < 1 for share in shares),
             bends=float(np.median(sizes)) if sizes else 0.0,
             doubts=self._doubts(keyframes),
+            asked=self._config.judge.parallax.on,
         )
 
     def _doubts(self, keyframes: Sequence[AlignedKeyframe]) -> Doubts | None:
@@ -157,7 +164,7 @@ class Judge:
             for error, into in ((np.log(ratio[:, 0]), predicted), (self._log_delivered(k)[use], delivered)):
                 into.append(HiddenErrors(error, sigma, spread, *where))
         # A map whose points err together would be called the model's error.
-        undone, aligned = sum(kept.share == 0 for kept in self._kept.values()), sum(k.alignment.ok for k in keyframes)
+        undone, aligned = self._shares(keyframes).count(0), sum(k.alignment.ok for k in keyframes)
         against = f"{undone} of {aligned} bends to the map's points had to be undone" if 2 * undone > aligned else ""
         return Doubts(tuple(predicted), tuple(delivered), against) if predicted else None
 
@@ -200,6 +207,7 @@ class Judge:
             alignment = bent(alone, part, k.view.observed, self._config.alignment)
             if alignment.bend is not None:
                 return replace(k, alignment=replace(alignment, unbent_because=kept.reason), bend=part)
+            kept = self._kept[k.keyframe.name] = Kept(0.0, f"{kept.reason}, and its points trust no such part of it")
         alignment = replace(alone, unbent_because=kept.reason)
         level = unbent(replace(k.view, scale=alone.scale), self._config.bending)
         return replace(k, alignment=alignment, bend=level)

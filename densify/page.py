@@ -12,6 +12,7 @@ from densify.coverage import seen_well
 from densify.dense_map import DenseMap
 from densify.evaluation.records import MapFigures
 from densify.joining import Merged, joined_name
+from densify.judging.verdict import spoke
 from densify.pipeline import SubmapResult
 from densify.predictions import SeenKeyframe
 from lightdepth.camera import CameraModel
@@ -213,7 +214,8 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
         text = f"Map {result.dense.submap.id}: {j.verdict}."
         if j.surface is not None:
             met = "" if j.surface.median_met is None else f" {100 * j.surface.median_met:.1f} % in the median;"
-            text += f" The surface against the images:{met} {100 * j.surface.miss:.0f} % of their rays miss it."
+            text += f" The surface against the images:{met} {100 * j.surface.miss:.0f} % of their rays miss it"
+            text += "." if spoke(j.surface) else f" ({j.surface.points} pixels, too few to judge by)."
         braked = [a for a in result.dense.alignments if a.unbent_because]
         if braked:
             text += f" {j.undone} keyframes keep one scale, {j.lessened} a part of their bend; "

@@ -36,7 +36,7 @@ from lightdepth.errors import (
     MissingOption,
     PartialFailure,
 )
-from lightdepth.foreign_text import for_terminal
+from lightdepth.foreign_text import for_line
 from lightdepth.signals import ending_on_signals
 
 GROUP = "lightdepth.commands"
@@ -131,7 +131,7 @@ def _main(argv: list[str]) -> int:
         _say(f"lightdepth {verb}: {error}")
         return 4
     except AlreadyFinished as error:
-        print(for_terminal(f"lightdepth {verb}: {error}"))
+        print(for_line(f"lightdepth {verb}: {error}"))
         return 0
     except (MachineFailure, OSError, MemoryError, RuntimeError) as error:
         return _failed(verb, error)
@@ -147,8 +147,8 @@ def _main(argv: list[str]) -> int:
 
 
 def _say(line: str, flush: bool = False) -> None:
-    """A line on standard error; names in it do nothing to the terminal."""
-    print(for_terminal(line), file=sys.stderr, flush=flush)
+    """A line on standard error, whatever names are in it."""
+    print(for_line(line), file=sys.stderr, flush=flush)
 
 
 def _is_lost(verb: str) -> bool:
@@ -168,6 +168,11 @@ def _failed(verb: str, error: Exception) -> int:
     if failure is not None:
         _say(f"lightdepth {verb}: {failure}")
         return 5
+    if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop from "):  # Path.resolve, until 3.12
+        _say(
+            f"lightdepth {verb}: {str(error).removeprefix('Symlink loop from ')}: links in a circle; give another path"
+        )
+        return 3
     if not isinstance(error, OSError) or error.filename is None or isinstance(error.filename, int):
         raise error
     _say(f"lightdepth {verb}: {os.fsdecode(error.filename)}: {error.strerror or error}")

@@ -21,6 +21,7 @@ from lightdepth.datasets import (
     read_hamlyn,
     read_simcol,
     write_c3vd,
+    write_folder,
     write_hamlyn,
     write_simcol,
 )
@@ -362,3 +363,18 @@ def test_a_folder_that_is_no_data_set_is_refused_by_what_was_asked_for(tmp_path)
         open_sequence(tmp_path, "hamlyn")
     with refused(found="no FrameBuffer_NNNN.png in it"):
         open_sequence(tmp_path, "simcol")
+
+
+def test_what_all_frames_have_in_common_is_told_by_the_first_that_can_be_read(tmp_path):
+    write_folder(colon(0, 4).frames, tmp_path)
+    images = sorted((tmp_path / "frames").iterdir())
+    images[0].write_bytes(images[0].read_bytes()[:200])
+    frames = open_sequence(tmp_path)
+    assert frames.first().name == frames.names[1] and frames.image_size() == (CAMERA.width, CAMERA.height)
+    with refused("not a readable image"):
+        frames[0]
+    assert main(["import", str(tmp_path), "-o", str(tmp_path / "imported")]) == 0
+    for image in images[1:]:
+        image.write_bytes(b"")
+    with refused("not a readable image", where=images[0].name):
+        open_sequence(tmp_path).first()

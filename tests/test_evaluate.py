@@ -141,6 +141,13 @@ def test_words_of_a_table_cannot_break_it():
     assert "| m & n | x/y |" in table.markdown()
 
 
+def test_a_name_stays_in_its_cell_whatever_is_in_it():
+    table = Table("t", ["a", "b"], [["one\ntwo $x^2$ {~}\\", 3]])
+    assert r"| one\ntwo $x^2$ {~}\ | 3 |" in table.markdown().splitlines()
+    said = r"one\textbackslash{}ntwo \$x\textasciicircum{}2\$ \{\textasciitilde{}\}\textbackslash{} & 3 \\"
+    assert said in table.latex()
+
+
 def test_the_csv_has_every_figure_with_its_unit_and_the_json_the_same(judged):
     with (judged / "metrics.csv").open(newline="") as file:
         headers, *rows = csv.reader(file)

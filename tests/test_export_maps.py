@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from colons import colon, sequence, slam, truth
+from raising import refused
 from scipy.spatial import cKDTree
 
 from densify.config import DensifyConfig
@@ -266,6 +267,30 @@ def test_without_its_map_and_frames_a_run_is_still_exported_and_what_is_missing_
     write_text_model(replace(submap, keyframes=submap.keyframes[1:]), tmp_path / "other")
     out = str(tmp_path / "o")
     assert main(["export", str(place / "run"), "-o", out, "--to", "colmap", "--map", str(tmp_path / "other")]) == 3
+
+
+@pytest.mark.filterwarnings("always:without its picture")
+def test_a_picture_that_cannot_be_read_is_left_out_and_said(place, tmp_path):
+    shutil.copytree(place / "data", tmp_path / "data")
+    images = sorted((tmp_path / "data" / "frames").iterdir())
+    images[0].write_bytes(images[0].read_bytes()[:200])
+    given = [str(place / "run"), "--data", str(tmp_path / "data"), "--map", str(place / "map")]
+    for to in ("tum", "nerfstudio"):
+        assert main(["export", *given, "-o", str(tmp_path / to), "--to", to]) == 0
+        with_it = json.loads((tmp_path / to / "run.json").read_text())["warnings"]
+        assert any("without its picture" in warning for warning in with_it)
+    assert len(list((tmp_path / "nerfstudio" / "map_000" / "images").iterdir())) == 7
+
+
+@pytest.mark.parametrize("rows", [0, 1, 4])
+def test_a_table_of_keyframes_that_lacks_some_is_refused_and_one_that_is_gone_is_done_without(place, tmp_path, rows):
+    shutil.copytree(place / "run" / "map_000", tmp_path / "map_000")
+    table = tmp_path / "map_000" / "keyframes.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:rows]))
+    with refused("no row for frame", where="keyframes.csv", cure="numbers are names"):
+        read_exportables(tmp_path / "map_000")
+    table.unlink()
+    assert len(read_exportables(tmp_path / "map_000")[0].submap.keyframes) == 8
 
 
 def test_what_cannot_be_exported_is_refused_with_what_could(place, tmp_path, capsys):

@@ -91,6 +91,24 @@ def test_a_mesh_is_seen_from_outside_and_from_a_place_of_its_own():
     assert (away == 255).all()
 
 
+@pytest.mark.parametrize(("size", "away"), [(1e-9, 0.0), (1.0, 1e6), (1e9, 0.0), (1e-3, 1e4)])
+def test_a_mesh_looks_the_same_whatever_the_unit_of_its_map_and_wherever_that_lies(size, away):
+    mesh = trimesh.creation.icosphere(3, 2.0)
+    vertices, triangles = np.asarray(mesh.vertices) * [3, 2, 1], np.asarray(mesh.faces)
+    for place in ({}, {"origin": np.array([0, 0.1, -8.0]), "axes": np.eye(3)}):
+        moved = {"origin": place["origin"] * size + away, "axes": place["axes"]} if place else {}
+        usual = MeshView.of(vertices, triangles, (80, 60), **place).picture()
+        seen = MeshView.of(vertices * size + away, triangles, (80, 60), **moved).picture()
+        assert (np.abs(seen.astype(int) - usual) > 12).any(-1).mean() < 0.02
+
+
+def test_a_single_triangle_is_seen_whole():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 0.7, 0]])
+    seen = (MeshView.of(corners, np.array([[0, 1, 2]]), (80, 60)).picture() < 255).any(-1)
+    assert 0.15 < seen.mean() < 0.6
+    assert not (seen[0].any() or seen[-1].any() or seen[:, 0].any() or seen[:, -1].any())
+
+
 def test_a_mesh_of_nothing_is_a_white_picture():
     empty = np.zeros((0, 3))
     assert (MeshView.of(empty, empty.astype(int), (8, 6)).picture(empty) == 255).all()

@@ -13,7 +13,8 @@ from densify.evaluation.depth_files import DepthReading
 from lightdepth.cli import main, parse
 from lightdepth.command_line.warned import warnings_as_sentences
 from lightdepth.commands.predict import predict
-from lightdepth.foreign_text import for_table, for_terminal, from_table
+from lightdepth.foreign_text import for_line, for_table, for_terminal, from_table
+from lightdepth.reporting.report import Report
 from lightdepth.reporting.run import paths_in, run_folder
 
 EVIL = "\x1b]0;mine\x07\x1b[31m\x9b2J\rgone\u202e"
@@ -38,6 +39,29 @@ def test_a_name_reaches_the_terminal_and_the_log_without_what_a_terminal_obeys(t
         run.warn(EVIL)
     said = capsys.readouterr()
     assert harmless(said.err) and harmless(said.out) and harmless((tmp_path / "run" / "log.txt").read_text())
+
+
+def test_an_error_stays_one_line_whatever_ends_of_lines_are_in_a_name(tmp_path, capsys):
+    name = "one\ntwo\u2028three\u2029four\r\nfive"
+    assert for_line(name) == r"one\ntwo\u2028three\u2029four\r\nfive"
+    assert main(["predict", str(tmp_path / name), "-o", str(tmp_path / "out")]) == 3
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and for_line(name) in said
+    (tmp_path / name).mkdir()
+    with run_folder(tmp_path / "run", "predict", {"data": tmp_path / name}) as run:
+        run.warn(f"{tmp_path / name}: doubtful")
+        run.log("a table\nof two lines")
+    log = (tmp_path / "run" / "log.txt").read_text("utf-8").splitlines()
+    assert len(log) == 3 and log[1].endswith("a table") and "data-" in log[0] and "two" not in log[0]
+
+
+def test_a_name_in_a_page_does_not_turn_round_what_follows_it(tmp_path):
+    page = Report(EVIL)
+    page.text(EVIL)
+    page.table([EVIL], [[EVIL]])
+    page.figures([(b"", EVIL)])
+    page.write(tmp_path / "report.html")
+    assert harmless((tmp_path / "report.html").read_text("utf-8"))
 
 
 @pytest.mark.parametrize("text", ["=cmd|' /C calc'!A1", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "'=1"])

@@ -12,7 +12,7 @@ from densify.dense_map import DenseMap
 from densify.densified import Densified
 from densify.fusion.volume import FusionConfig
 from densify.judgement import Judge
-from densify.judging.brake import Tried, kept, kept_of_finer
+from densify.judging.brake import Kept, Tried, kept, kept_of_finer
 from densify.judging.columns import Columns
 from densify.judging.config import JudgeConfig
 from densify.judging.verdict import Judgement, Verdict, proposal, worst
@@ -103,6 +103,33 @@ def test_white_frames_are_never_green(submap, frames):
     judgement, _ = judged(submap, white, truth)
     assert judgement.images.count == 0 and judgement.surface is None
     assert judgement.verdict.colour != "green" and "too little texture" in judgement.verdict.sentence
+
+
+def test_images_that_were_not_asked_are_not_said_to_have_too_little_texture(submap, frames):
+    config = replace(COARSE, judge=JudgeConfig(parallax=ParallaxConfig(on=False)))
+    judgement = densify_submap(submap, sequence(frames), truth, config).judgement
+    assert judgement is not None and judgement.verdict.colour == "amber"
+    assert "were not asked" in judgement.verdict.sentence and "texture" not in judgement.verdict.sentence
+
+
+def test_a_part_of_a_bend_that_its_points_do_not_trust_counts_as_undone(submap, frames, monkeypatch):
+    monkeypatch.setattr("densify.judgement.kept", lambda tried: dict.fromkeys(tried, Kept(0.5, "half")))
+    assert judged(submap, frames)[0].lessened > 3
+    monkeypatch.setattr("densify.judgement.bent", lambda alone, *_: alone)
+    judgement, result = judged(submap, frames)
+    aligned = [a for a in result.dense.alignments if a.ok]
+    assert (judgement.undone, judgement.lessened) == (len(aligned), 0)
+    assert all(a.bend is None and "trust no such part" in a.unbent_because for a in aligned)
+
+
+def test_bends_of_keyframes_that_are_not_in_the_surface_are_not_counted(submap, frames, monkeypatch):
+    monkeypatch.setattr("densify.judgement.kept", lambda tried: dict.fromkeys(tried, Kept(0.0, "none")))
+    monkeypatch.setattr(
+        "densify.pipeline.uncontradicted_keyframes",
+        lambda keyframes, *_: [k.unread("gone") for k in keyframes[:2]] + list(keyframes[2:]),
+    )
+    judgement, result = judged(submap, frames)
+    assert judgement.undone == judgement.aligned == sum(bool(a.unbent_because) for a in result.dense.alignments)
 
 
 def test_the_surface_uses_every_point(submap, frames):
@@ -242,6 +269,13 @@ def known(**changes) -> Judgement:
 def test_the_verdict_has_a_colour_and_a_reason_with_figures(colour, sentence, changes):
     verdict = known(**changes).verdict
     assert verdict.colour == colour and sentence in verdict.sentence, verdict
+
+
+def test_a_verdict_says_nothing_twice():
+    for surface in (None, Withheld(20, 0.2, 0.3, 0.0, 0.2)):
+        for off in (0.08, 0.2):
+            said = known(surface=surface, hidden=Withheld(500, off, 0.3, 0.0, off)).verdict.sentence
+            assert said.count("hidden blocks") == said.count("the images") == 1, said
 
 
 def test_a_better_map_is_proposed_where_the_images_speak_against_it_and_only_there():

@@ -14,6 +14,7 @@ from colons import colon, sequence, slam, truth
 
 from densify.config import DensifyConfig
 from densify.evaluation.records import AlignedFigures, DistanceFigures, MapFigures, SurfaceFigures
+from densify.judging.withheld import Withheld
 from densify.page import Gallery, densify_page
 from densify.pipeline import densify
 from lightdepth.reporting.figures import png
@@ -127,3 +128,17 @@ def test_an_empty_surface_has_a_report_too(made, tmp_path):
     densify_page("Maps", [replace(result, dense=dense)], gallery, []).write(tmp_path / "report.html")
     check_self_contained(tmp_path / "report.html")
     assert "0 of 4" in (tmp_path / "report.html").read_text()
+
+
+def test_what_too_few_pixels_say_of_a_surface_is_told_as_that(made, tmp_path):
+    (result,), gallery = made
+    for pixels in (500, 20):
+        judged = replace(result.judgement, surface=Withheld(pixels, 0.2, 0.3, 0.0, 0.2))
+        densify_page("Maps", [replace(result, judgement=judged)], gallery, []).write(tmp_path / "report.html")
+        text = (tmp_path / "report.html").read_text()
+        assert ("(20 pixels, too few to judge by)" in text) == (pixels == 20)
+
+
+def test_long_names_are_broken_where_the_page_ends(tmp_path):
+    Report("x").write(tmp_path / "report.html")
+    assert "overflow-wrap: anywhere" in (tmp_path / "report.html").read_text()

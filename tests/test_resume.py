@@ -196,6 +196,8 @@ def test_select_tells_of_a_run_that_was_stopped(tmp_path, stopping, each_alone):
     stopping(None)
     with refused("beside it is an unfinished run of select"):
         chosen(tmp_path / "list.txt")
+    with refused("not resumed, --sift-nodes.min-spread was 0.0 and is 0.1"):
+        chosen(tmp_path / "list.txt", sift_nodes=replace(ALL_ARE_KEPT, min_spread=0.1), resume=True)
     with refused("not resumed, --no-frames was False and is True"):
         chosen(tmp_path / "list.txt", no_frames=True, resume=True)
     chosen(tmp_path / "list.txt", overwrite=True)
@@ -204,6 +206,53 @@ def test_select_tells_of_a_run_that_was_stopped(tmp_path, stopping, each_alone):
     (tmp_path / ".other.txt.unfinished" / "mine").write_text("")
     with refused("was not made by this program"):
         chosen(tmp_path / "other.txt")
+
+
+def test_a_finished_selection_is_known_again_by_what_it_was_made_of(tmp_path):
+    write_folder(colon(0, 4).frames, tmp_path / "data")
+    whole = partial(select, sift_nodes=ALL_ARE_KEPT)
+    again = partial(whole, resume=True)
+    whole(tmp_path / "data", tmp_path / "list.txt")
+    (tmp_path / "elsewhere").symlink_to(tmp_path / "data")
+    for same in ("data", "elsewhere"):
+        with pytest.raises(AlreadyFinished):
+            again(tmp_path / same, tmp_path / "list.txt")
+    for other in ({"with_folder": True}, {"no_frames": True}, {"bit_depth": 9}):
+        with refused("other frames or settings"):
+            again(tmp_path / "data", tmp_path / "list.txt", **other)
+    text = (tmp_path / "list.txt").read_text()
+    (tmp_path / "list.txt").write_text(text[: text.rindex("\n", 0, -1) + 1])
+    with refused("was changed since"):
+        again(tmp_path / "data", tmp_path / "list.txt")
+    (tmp_path / "list.txt").write_text(text)
+    (tmp_path / "list.csv").unlink()
+    with refused("list.csv beside it is gone"):
+        again(tmp_path / "data", tmp_path / "list.txt")
+    (tmp_path / "list.csv").write_text("")
+    first = min((tmp_path / "data" / "frames").iterdir())
+    first.write_bytes(max((tmp_path / "data" / "frames").iterdir()).read_bytes())
+    with refused("other frames or settings"):
+        again(tmp_path / "data", tmp_path / "list.txt")
+
+
+def test_what_came_to_stand_beside_a_list_meanwhile_is_not_replaced(tmp_path, monkeypatch):
+    write_folder(colon(0, 4).frames, tmp_path / "data")
+
+    def beside(*_) -> bytes:
+        select(tmp_path / "data", tmp_path / "list.md", sift_nodes=ALL_ARE_KEPT, no_frames=True)
+        return b""
+
+    monkeypatch.setattr("train.commands.select._sheet", beside)
+    with refused("list.csv", "already there"):
+        select(tmp_path / "data", tmp_path / "list.txt", sift_nodes=ALL_ARE_KEPT)
+    assert sorted(p.name for p in tmp_path.glob("*list*")) == ["list.csv", "list.html", "list.md"]
+
+
+def test_a_list_whose_hidden_neighbours_could_not_be_called_after_it_is_refused(tmp_path):
+    write_folder(colon(0, 4).frames, tmp_path / "data")
+    with refused("241 bytes"):
+        select(tmp_path / "data", tmp_path / ("x" * 237 + ".txt"))
+    assert [p.name for p in tmp_path.iterdir()] == ["data"]
 
 
 class Summed:

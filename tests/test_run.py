@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -228,3 +229,10 @@ def test_what_is_warned_of_during_a_run_is_shown_and_in_its_log_and_run_json(tmp
     assert json.loads((tmp_path / "out" / "run.json").read_text())["warnings"] == said
     log = (tmp_path / "out" / "log.txt").read_text()
     assert all(f" warning: {each}\n" in log for each in said) and "library" not in log
+
+
+def test_a_clock_that_is_set_back_during_a_run_makes_it_no_shorter(tmp_path, monkeypatch):
+    with run_folder(tmp_path / "out", "densify", {}):
+        monkeypatch.setattr(time, "time", lambda: 1e9)
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert 0 <= record["seconds"] < 60 and record["started"].startswith("2001-09-09")

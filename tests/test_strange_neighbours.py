@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 import os
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from raising import refused
+from videos import CAMERA
 
+from lightdepth.calibration import write_camera
+from lightdepth.cli import main
 from lightdepth.errors import AlreadyFinished
 from lightdepth.files.lock import is_live, lock_path
 from lightdepth.files.replacing import BEGUN, PARTS, RECORD, old_path, read_record, remains, unfinished_path
@@ -146,6 +150,41 @@ def test_a_line_that_tells_of_no_part_counts_as_not_written(tmp_path, line):
         file.write(line + "\n")
     with run_folder(tmp_path / "out", "densify", {"seed": 3}, resume=True) as run:
         assert list(run.parts or ()) == ["one"]
+
+
+@pytest.mark.parametrize("damage", ["gone", "another letter", "torn in the middle"])
+def test_what_was_finished_behind_a_damaged_line_is_made_again(tmp_path, damage):
+    """It may go on from what that line said: a list of frames whose first part is gone would be of other frames."""
+    with pytest.raises(KeyboardInterrupt), run_folder(tmp_path / "out", "densify", {}, resume=False) as run:
+        for part in ("one", "two", "three"):
+            run.finish_part(part, [], [part, 1.5, {"a b": 1e-17}])
+        raise KeyboardInterrupt
+    notes = unfinished_path(tmp_path / "out") / PARTS
+    first, second, third = notes.read_text().splitlines(keepends=True)
+    second = {"gone": "", "another letter": second.replace('"kept": ["two"', '"kept": ["twa"')}.get(damage, second[30:])
+    notes.write_text(first + second + third)
+    with suppress(KeyboardInterrupt), run_folder(tmp_path / "out", "densify", {}, resume=True) as run:
+        assert list(run.parts or ()) == ["one"]
+        run.finish_part("two", [])
+        raise KeyboardInterrupt
+    with run_folder(tmp_path / "out", "densify", {}, resume=True) as run:
+        assert list(run.parts or ()) == ["one", "two"] and run.kept_of("one")[:2] == ["one", 1.5]
+
+
+def test_a_file_that_is_a_link_to_nothing_is_refused_and_one_to_a_file_is_replaced(tmp_path, capsys):
+    write_camera(CAMERA, tmp_path / "camera.json")
+    (tmp_path / "loose.json").symlink_to("gone/camera.json")
+    (tmp_path / "link.json").symlink_to("precious.json")
+    (tmp_path / "circle").symlink_to("circle")
+    (tmp_path / "precious.json").write_text("mine")
+
+    def converted(name: str, given: str = "camera.json") -> int:
+        return main(["convert-camera", str(tmp_path / given), "-o", str(tmp_path / name), "--overwrite"])
+
+    assert converted("loose.json") == 3 and "link to nothing" in capsys.readouterr().err
+    assert converted("link.json") == 0 and not (tmp_path / "link.json").is_symlink()
+    assert (tmp_path / "precious.json").read_text() == "mine" and not (tmp_path / "gone").exists()
+    assert converted("circle") == 3 and converted("circle/a.json") == 3 and converted("new.json", "circle") == 3
 
 
 def test_a_run_that_another_version_began_is_not_gone_on_with(tmp_path):

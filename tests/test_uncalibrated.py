@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from colons import CAMERA, colon, slam
+from raising import refused
 from test_self_calibration import box_film, written
 
 from densify.dense_map import read_dense_map
@@ -18,10 +20,14 @@ from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel, Pinhole, Provenance
 from lightdepth.cli import main
 from lightdepth.datasets import SequenceSource, open_sequence
+from lightdepth.datasets.no_camera import NoCamera
+from lightdepth.errors import InputError
+from lightdepth.files.depths import white_of
 from lightdepth.files.images import to_bgr8
 from lightdepth.files.packed import read_packed, write_packed
 from lightdepth.maps import read_map
 from lightdepth.maps.colmap import write_text_model
+from lightdepth.option_names import option, options_below
 from lightdepth.reporting.run import run_folder
 from lightdepth.sfm.self_calibration import SelfCalibration, across
 from lightdepth.uncalibrated import found_camera, with_camera
@@ -178,6 +184,17 @@ def test_train_names_its_own_options_for_what_is_wrong_with_its_frames(tmp_path,
     data = ["--data.sequences", f"[{tmp_path / 'seq'}]"]
     assert lightdepth("train", "--preset", "tube_smoke", *data, "-o", tmp_path / "out") == 3
     assert "give --data.camera FILE" in " ".join(capsys.readouterr().err.split())
+
+
+def test_readers_call_options_as_the_verb_at_work_does(tmp_path):
+    (tmp_path / "color").mkdir()
+    with options_below("data"), refused(cure="give --data.camera FILE"):
+        raise NoCamera.at(tmp_path, "no camera.json")
+    with refused("expected the bits", where="--bit-depth"):
+        white_of([], 99)
+    with suppress(InputError), options_below("data"):
+        raise InputError("it", "is wrong", "mend it")
+    assert option("light") == "--light"
 
 
 def guessed(deviation: float, fov: float | None, field: float = 136.0) -> SelfCalibration:

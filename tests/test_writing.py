@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+import sqlite3
+import subprocess
+import sys
 
 import pytest
 
 from lightdepth.errors import InputError
+from lightdepth.files.machine import machine_failure
 from lightdepth.files.writing import move_whole, write_together, write_whole
 
 
@@ -30,6 +34,48 @@ def test_what_was_there_stays_when_a_writer_fails_half_way(tmp_path):
     with pytest.raises(RuntimeError):
         write_together({tmp_path / "first": "new", tmp_path / "a": half})
     assert (tmp_path / "a").read_text() == "old" and [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (ValueError("Error while serializing: I/O error: No space left on device (os error 28)"), "disk is full"),
+        (sqlite3.OperationalError("database or disk is full"), "disk is full"),
+        (sqlite3.OperationalError("disk I/O error"), "could not be read or written"),
+        (ValueError("I/O error: No such file or directory (os error 2)"), None),
+        (InputError("a.bin", "(os error 28)", "copy it again"), None),
+    ],
+)
+def test_what_libraries_say_of_a_full_disk_in_words_is_a_failure_of_the_machine(tmp_path, error, said):
+    found = machine_failure(error, tmp_path)
+    assert found is None if said is None else said in str(found) and "MB are free" in str(found)
+
+
+def test_a_full_disk_is_told_by_the_libraries_that_write_our_files_as_we_know_them_to_tell_it(tmp_path):
+    """In a process that may write no more than 64 kB a file. Another version may say it in another way."""
+    code = """
+import resource, signal, sqlite3, sys
+from pathlib import Path
+import torch
+from safetensors.torch import save_file
+from lightdepth.files.machine import machine_failure
+from lightdepth.files.writing import write_whole
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, 1 << 16))
+place, many = Path(sys.argv[1]), {"a": torch.zeros(100_000)}
+writers = [
+    lambda: write_whole(place / "a.ckpt", lambda path: torch.save(many, path)),
+    lambda: save_file(many, place / "b.safetensors"),
+]
+for write in writers:
+    try:
+        write()
+    except Exception as error:
+        assert "beyond the size" in str(machine_failure(error, place)), repr(error)
+    else:
+        raise AssertionError("written")
+"""
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=120)
 
 
 def test_a_place_that_cannot_be_written_to_is_named(tmp_path):

@@ -10,7 +10,6 @@ the run is complete.
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -31,6 +30,7 @@ from lightdepth.files.writing import sync_below, write_whole
 from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
+from lightdepth.option_names import options_below
 from lightdepth.reporting.names import KEPT, Names, names_of
 from lightdepth.reporting.record import versions, write_run_json
 from lightdepth.reporting.run import input_hash
@@ -108,13 +108,11 @@ class _Job:
 
 def _set_up(data: FrameDataModule) -> None:
     """Opens its sequences; what cannot be opened is told with the options of train, which lie below --data."""
-    try:
-        data.setup()
-    except NoCamera as error:
-        raise error.of_other_verb(error.where, "--data.camera", maps=False) from error
-    except InputError as error:
-        cure = re.sub(r"(?<![\w.-])--(camera|light|mask|format|bit-depth)\b", r"--data.\1", error.cure)
-        raise InputError(error.where, error.found, cure) from error
+    with options_below("data"):
+        try:
+            data.setup()
+        except NoCamera as error:
+            raise error.of_other_verb(error.where, maps=False) from error
 
 
 def _fitted(
@@ -125,7 +123,7 @@ def _fitted(
     job: _Job,
     start: Start | None,
 ) -> dict[str, float]:
-    started = time.time()
+    started = time.monotonic()
     _set_up(data)
     asked = {"settings": yaml.safe_load(job.config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
     output = output_of(folder) or folder

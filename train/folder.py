@@ -131,7 +131,11 @@ def training_folder(output: Path, resume: bool, overwrite: bool, inputs: Iterabl
 
 @contextmanager
 def _kept_or_gone(folder: Path, output: Path, hidden: bool) -> Iterator[None]:
-    """A block that fails keeps its checkpoints; without one, nothing is left of a run that it began."""
+    """A block that fails keeps its checkpoints; without one, nothing is left of a run that it began.
+
+    Not `reporting.run.kept_or_gone`, which removes a hidden folder as a whole and counts finished parts: a training may
+    stand in the output itself, beside files of others, which stay, and its checkpoints are kept whatever made it fail.
+    """
     there, fresh = folder.is_dir(), not any((folder / name).exists() for name in (*_OURS, BEGUN, RECORD))
     try:
         yield

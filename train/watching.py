@@ -13,7 +13,7 @@ from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging, Learn
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from lightdepth.errors import InputError
-from lightdepth.foreign_text import for_terminal
+from lightdepth.foreign_text import for_line
 from lightdepth.ranges import BELOW_ONE, at_least, checked
 from lightdepth.reporting.names import Names
 from lightdepth.signals import Received
@@ -114,6 +114,6 @@ class Echo:
     def __call__(self, line: str) -> None:
         if not first_process():
             return
-        print(for_terminal(line), file=sys.stderr, flush=True)
+        print(for_line(line), file=sys.stderr, flush=True)
         with self.log.open("a", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(for_terminal(self.names.text(line)) + "\n")
+            file.write(for_line(self.names.text(line)) + "\n")

@@ -32,7 +32,7 @@ from densify.evaluation.records import (
 )
 from densify.evaluation.suite import Suite, alone
 from densify.judging.withheld import WithheldOfMap
-from lightdepth.foreign_text import for_table
+from lightdepth.foreign_text import for_line, for_table
 from lightdepth.reporting.report import number
 
 _METRICS = {
@@ -87,28 +87,38 @@ class Table:
 
 
 def cell_text(cell: object) -> str:
-    return cell if isinstance(cell, str) else number(cell)
+    """A cell of a table in text: names with ends of lines in them would end its row."""
+    return for_line(cell) if isinstance(cell, str) else number(cell)
+
+
+_TEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "{": r"\{",
+        "}": r"\}",
+        "$": r"\$",
+        "&": r"\&",
+        "%": r"\%",
+        "_": r"\_",
+        "#": r"\#",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+        "δ": r"$\delta$",
+        "<": "$<$",
+        "²": "$^2$",
+        "³": "$^3$",
+        "×": r"$\times$",
+        "≤": r"$\le$",
+        "–": "--",
+        "∞": r"$\infty$",
+        "→": r"$\to$",
+    }
+)
+"""All at once: what one sign becomes has others in it."""
 
 
 def _tex(text: str) -> str:
-    for sign, code in (
-        ("\\", r"\textbackslash "),
-        ("&", r"\&"),
-        ("%", r"\%"),
-        ("_", r"\_"),
-        ("#", r"\#"),
-        ("δ", r"$\delta$"),
-        ("<", "$<$"),
-        ("²", "$^2$"),
-        ("³", "$^3$"),
-        ("×", r"$\times$"),
-        ("≤", r"$\le$"),
-        ("–", "--"),
-        ("∞", r"$\infty$"),
-        ("→", r"$\to$"),
-    ):
-        text = text.replace(sign, code)
-    return text
+    return text.translate(_TEX)
 
 
 # One or several sequences: what was judged by name, columns as a suite has them.

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.exporting.exported import Exportable
-from densify.exporting.images import known_camera, pinhole_of, seen_by, write_image
+from densify.exporting.images import frame_of, known_camera, pinhole_of, seen_by, write_image
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 from lightdepth.files.reading import reading
@@ -69,7 +69,7 @@ def write_colmap(exported: Exportable, folder: Path, frames: FrameSequence | Non
         depth, normals = exported.seen_from(keyframe, keyframe.camera)
         write_array(stereo / "depth_maps" / f"{keyframe.name}.geometric.bin", depth)
         write_array(stereo / "normal_maps" / f"{keyframe.name}.geometric.bin", normals)
-        frame = None if frames is None else frames.by_number(own.number)
+        frame = frame_of(frames, own.number)
         if frame is not None:
             write_image(folder / "images" / keyframe.name, frame.image)
             picture = seen_by(frame.image, own.camera, keyframe.camera)

@@ -175,12 +175,15 @@ def _is_of(submap: Submap, dense: DenseMapFiles) -> bool:
 
 
 def _without_observations(folder: Path, dense: DenseMapFiles) -> Submap:
-    """Keyframes as the run's files have them: names, camera, poses."""
-    names = {int(n): f"{int(n):06d}" for n in dense.numbers}
-    if (folder / "keyframes.csv").is_file():
-        path = folder / "keyframes.csv"
+    """Keyframes as the run's files have them: names, camera, poses. Where their table is gone, numbers are names."""
+    names, path = {int(n): f"{int(n):06d}" for n in dense.numbers}, folder / "keyframes.csv"
+    if path.is_file():
         with reading(path, "a table of keyframes"), path.open(encoding="utf-8", newline="") as file:
-            names |= {int(row["frame"]): from_table(row["keyframe"]) for row in csv.DictReader(file)}
+            found = {int(row["frame"]): from_table(row["keyframe"]) for row in csv.DictReader(file)}
+        if missing := [n for n in names if n not in found]:
+            cure = "copy it again from the run, or leave it out: then numbers are names"
+            raise InputError(path, f"no row for frame {missing[0]}, which is in the trajectory beside it", cure)
+        names |= found
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     keyframes = tuple(
         Keyframe(names[int(n)], dense.camera, np.linalg.inv(pose), *none)

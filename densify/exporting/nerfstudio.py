@@ -15,7 +15,7 @@ import numpy as np
 from densify.dense_map import write_cloud
 from densify.exporting.colmap import stem
 from densify.exporting.exported import Exportable
-from densify.exporting.images import known_camera, write_image
+from densify.exporting.images import frame_of, known_camera, write_image
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 
@@ -49,7 +49,7 @@ def write_nerfstudio(exported: Exportable, folder: Path, frames: FrameSequence |
         depth = exported.seen_from(keyframe, camera)[0]
         np.save(folder / "depths" / f"{name}.npy", depth / np.float32(DEPTH_UNIT))
         entry: dict[str, object] = {"file_path": f"images/{name}.png", "depth_file_path": f"depths/{name}.npy"}
-        frame = None if frames is None else frames.by_number(keyframe.number)
+        frame = frame_of(frames, keyframe.number)
         if frame is not None:
             write_image(folder / "images" / f"{name}.png", frame.image)
             if not frame.valid.all():

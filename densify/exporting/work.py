@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from densify.dense_map import map_folders, run_record
 from densify.exporting.colmap import write_colmap
 from densify.exporting.exported import Exportable, read_exportables
+from densify.exporting.images import frame_of
 from densify.exporting.meshes import write_mesh, write_surfaces
 from densify.exporting.nerfstudio import write_nerfstudio
 from densify.exporting.trees import write_climb, write_trajectory
@@ -106,8 +107,8 @@ def _frames(run: Run, source: Path, given: Path | None) -> FrameSequence | None:
 def _times(frames: FrameSequence | None, maps: list[Exportable]) -> dict[int, float]:
     """Seconds of keyframes by frame number, where the frames have them."""
     found = {}
-    for number in sorted({k.number for m in maps for k in m.submap.keyframes}) if frames is not None else ():
-        frame = frames.by_number(number) if frames is not None else None
+    for number in sorted({k.number for m in maps for k in m.submap.keyframes}):
+        frame = frame_of(frames, number)
         if frame is not None and frame.time is not None:
             found[number] = frame.time
     return found

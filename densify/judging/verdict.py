@@ -51,6 +51,8 @@ class Judgement:
     """median size of the bends in deviations of their prior; 1 is usual"""
     doubts: Doubts | None = None
     """hidden points with the uncertainty that was predicted of them; None where the model predicts none"""
+    asked: bool = True
+    """whether the images were asked at all"""
 
     @property
     def number(self) -> float:
@@ -169,10 +171,10 @@ def _verdict(j: Judgement) -> Verdict:
     if j.surface is not None and spoke(j.surface):
         said, red, amber = _by_images(j.surface)
     else:
-        said = "the images have too little texture or parallax to judge by"
-        red, amber = [], [f"{said}; hidden blocks of the map's wall are {_share(number)} off"]
-        if not number <= RED:
-            red.append(f"hidden blocks of the map's wall are {_share(number)} off, and the images say nothing")
+        silent = "the images have too little texture or parallax to judge by"
+        said = silent if j.asked else "the images were not asked (--judge.parallax.on false)"
+        hidden = f"hidden blocks of the map's wall are {_share(number)} off"
+        red, amber = ([], [f"{said}; {hidden}"]) if number <= RED else ([f"{hidden}, and {said}"], [])
     amber += _few(j.keyframes, j.aligned)
     light = j.images if j.images.count >= _LEAST else j.blocks
     remarks = []

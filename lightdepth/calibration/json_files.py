@@ -14,6 +14,7 @@ from lightdepth.camera.provenance import CameraSource
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.files.writing import write_whole
+from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 
 
@@ -70,7 +71,7 @@ def fields_of(camera: CameraModel) -> dict[str, object]:
 
 def light_from_text(text: str) -> PhotometricCalibration:
     """Values written out as `gamma=2.2,mu=0`."""
-    where = f"--light {text}"
+    where = f"{option('light')} {text}"
     pairs = [[side.strip() for side in part.split("=", 1)] for part in text.split(",")]
     if any(len(pair) != 2 for pair in pairs):
         raise InputError(

@@ -35,6 +35,7 @@ from lightdepth.camera import (
 from lightdepth.errors import InputError
 from lightdepth.files.text import to_numbers
 from lightdepth.files.writing import write_whole
+from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 
 if TYPE_CHECKING:
@@ -52,7 +53,9 @@ def read_vicalib(path: Path) -> CameraModel:
     model = _only(root, "camera_model", path)
     kind = model.get("type", "")
     if kind == "gamma":
-        raise InputError(path, "a photometric calibration (type gamma)", "expected a geometric one. This is --light's")
+        raise InputError(
+            path, "a photometric calibration (type gamma)", f"expected a geometric one. This is {option('light')}'s"
+        )
     if kind not in _COUNTS:
         raise InputError(path, f"camera_model type {kind!r} is not known", f"expected one of {', '.join(_COUNTS)}")
     width, height = (_whole(model, tag, path) for tag in ("width", "height"))
@@ -96,7 +99,7 @@ def read_photometric(path: Path) -> PhotometricCalibration:
     """Light and response of EndoMapper's photometric calibration. Metres become millimetres."""
     root = xml_root(path)
     if root.find(".//light_model") is None and root.find(".//params") is not None:
-        raise InputError(path, "a geometric calibration", "expected a photometric one. This is --camera's")
+        raise InputError(path, "a geometric calibration", f"expected a photometric one. This is {option('camera')}'s")
     light = _only(root, "light_model", path)
     if light.get("type", "sls") != "sls":
         raise InputError(path, f"light_model type {light.get('type')!r} is not known", "expected sls, one spot light")

@@ -69,7 +69,7 @@ def calibrate_light(
     else:
         sparse_map, frames = open_with_map(source, map, pairing)
         sparse_map = by_the_images(sparse_map, frames)
-        given = frames[0].camera if camera is not None else None
+        given = frames.first().camera if camera is not None else None
         check_pairing(sparse_map, frames, pairing, given=given)
         fit = fit_on_map(frames, sparse_map, camera=given, rng=rng)
         what = f"{data}, {sparse_map.source}"

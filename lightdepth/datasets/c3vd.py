@@ -30,6 +30,7 @@ from lightdepth.datasets.sequence import FrameSequence, corners, numbered_files,
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame
+from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.regular import regular
 from lightdepth.sparse_map import check_rigid
@@ -135,7 +136,7 @@ def read_c3vd(
                 path,
                 f"images are {width}x{height}",
                 f"C3VD's camera is for {whole.width}x{whole.height} and its reductions. Give the camera of cropped "
-                "images with --camera FILE",
+                f"images with {option('camera')} FILE",
             )
         camera = whole.resized(width, height)
     ray_z = camera.rays()[0][..., 2]
@@ -195,12 +196,12 @@ def _undistorted_camera(path: Path, tree: _Tree) -> CameraModel:
         raise InputError(
             path,
             found,
-            "give their camera with --camera FILE; that of EndoGSLAM's scripts is PINHOLE at 1350x1080, "
+            f"give their camera with {option('camera')} FILE; that of EndoGSLAM's scripts is PINHOLE at 1350x1080, "
             f"fx {fx:g} fy {fy:g} cx {cx:g} cy {cy:g}, pixel_center 0.0",
         )
     warnings.warn(
         f"{path}: {found}; sorted into color/ and depth/, they are taken for EndoGSLAM's, undistorted to a pinhole of "
-        f"fx {fx:g} at 1350x1080. Give --camera FILE where another program undistorted them",
+        f"fx {fx:g} at 1350x1080. Give {option('camera')} FILE where another program undistorted them",
         stacklevel=6,
     )
     return C3VD_UNDISTORTED

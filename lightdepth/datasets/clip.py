@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from lightdepth.errors import InputError
+from lightdepth.option_names import option
 
 _DARK = 4096 / 65535
 """Highest value of a video of 16 bits, of white, below which its samples may be of fewer bits."""
@@ -48,11 +49,11 @@ class Clip(Protocol):
 def white_level(bits: int, bit_depth: int | None) -> float:
     """The share of a file's own white that is white, where its samples have `bits` and the user says `bit_depth`."""
     if bit_depth is not None and not 1 <= bit_depth <= 32:
-        raise InputError("--bit-depth", f"{bit_depth}", "expected the bits of a sample, from 8 to 32")
+        raise InputError(option("bit-depth"), f"{bit_depth}", "expected the bits of a sample, from 8 to 32")
     if bit_depth is None or bits <= 8:
         return 1.0
     if not 1 <= bit_depth <= bits:
-        raise InputError("--bit-depth", f"{bit_depth}, of a video of {bits} bits", f"expected up to {bits}")
+        raise InputError(option("bit-depth"), f"{bit_depth}, of a video of {bits} bits", f"expected up to {bits}")
     return (2.0**bit_depth - 1) / (2.0**bits - 1)
 
 
@@ -62,7 +63,9 @@ def brightened(pixels: np.ndarray, white: float, where: str) -> np.ndarray:
         return pixels
     highest = float(pixels.max()) / np.iinfo(pixels.dtype).max
     if highest > white * 1.01:
-        raise InputError(where, f"pixels {highest / white:.3g} times as bright as white", "give a larger --bit-depth")
+        raise InputError(
+            where, f"pixels {highest / white:.3g} times as bright as white", f"give a larger {option('bit-depth')}"
+        )
     top = float(np.iinfo(pixels.dtype).max)
     result: np.ndarray = np.rint(np.minimum(pixels / np.float32(white), np.float32(top))).astype(pixels.dtype)
     return result
@@ -79,7 +82,7 @@ def check_depth(clip: Clip, images: Sequence[np.ndarray]) -> None:
         clip.path,
         f"a video of {clip.bits} bits whose highest value is {highest * 65535:.0f}: samples of {least} bits stored as "
         "they are, or pictures that are nearly black",
-        f"give --bit-depth {least}, or --bit-depth {clip.bits} if they are dark",
+        f"give {option('bit-depth')} {least}, or {option('bit-depth')} {clip.bits} if they are dark",
     )
 
 

@@ -29,6 +29,7 @@ from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.files.schema import read_json
 from lightdepth.frame import Frame, check_image_size, frame_number, resized_mask
 from lightdepth.maps import read_map
+from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.regular import regular
 
@@ -89,7 +90,7 @@ def read_endomapper(
         raise InputError(
             images[0],
             "number 0, but EndoMapper counts frames from 1 (out1.png is the first of the video)",
-            "extract them so, or read them with --format folder",
+            f"extract them so, or read them with {option('format')} folder",
         )
     numbers = checked_images(path, images)
     width, height = image_size(images[0])
@@ -99,7 +100,7 @@ def read_endomapper(
             raise InputError(
                 path,
                 f"no Endoscope_XX_{GEOMETRY}.xml here, nor in Calibrations/ here or above",
-                "put it beside the frames, or give --camera FILE",
+                f"put it beside the frames, or give {option('camera')} FILE",
             )
         camera = at_size(read_camera(file), width, height, images[0].name)
     if light is None:
@@ -214,7 +215,7 @@ def calibration_file(path: Path, kind: str) -> Path | None:
                 folder,
                 f"{len(found)} calibrations ({', '.join(found)}) and no Seq_NNN_info.json that says which endoscope "
                 "it was",
-                "put the right one beside the frames, or give --camera and --light",
+                f"put the right one beside the frames, or give {option('camera')} and {option('light')}",
             )
         for name, file in found.items():
             label = name.removeprefix("Endoscope_").removesuffix(f"_{kind}.xml")
@@ -223,7 +224,7 @@ def calibration_file(path: Path, kind: str) -> Path | None:
         raise InputError(
             folder,
             f"{', '.join(found)}, but the sequence was made with endoscope {number}",
-            "give its calibration with --camera and --light",
+            f"give its calibration with {option('camera')} and {option('light')}",
         )
     return None
 

@@ -31,6 +31,7 @@ from lightdepth.datasets.sequence import FrameSequence, list_images, numbered_fi
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame, frame_number
+from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.regular import regular
 
@@ -83,7 +84,7 @@ def read_endoslam(
                 path,
                 "no camera: EndoSLAM's are MATLAB files (.mat), which are not read",
                 'write the numbers into a camera.json ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, '
-                "fy, cx, cy]}) and give it with --camera",
+                f"fy, cx, cy]}}) and give it with {option('camera')}",
             )
         camera = _read_calibration(file) if _simulated(path) else read_camera(file, (width, height))
     poses = _poses(path)

@@ -24,6 +24,7 @@ from lightdepth.datasets.sequence import FrameSequence, numbered_files
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame
+from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 
 
@@ -77,7 +78,7 @@ def read_hamlyn(
     if camera is None:
         file = camera_file(path)
         if not file.is_file():
-            raise InputError(path, "no intrinsics.txt", "put the sequence's there, or give --camera FILE")
+            raise InputError(path, "no intrinsics.txt", f"put the sequence's there, or give {option('camera')} FILE")
         width, height = image_size(images[0])
         camera = read_camera(file, (width, height))
     ray_z = camera.rays()[0][..., 2]

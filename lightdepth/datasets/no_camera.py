@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Self
 
 from lightdepth.errors import InputError
+from lightdepth.option_names import option
 
 _FILE = 'FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]})'
 _MAP = "or, where a verb takes --map, a map that has one"
@@ -16,15 +17,15 @@ class NoCamera(InputError):
 
     @classmethod
     def at(cls, path: Path, found: str) -> Self:
-        return cls(path, found, f"give --camera {_FILE}, {_MAP}")
+        return cls(path, found, f"give {option('camera')} {_FILE}, {_MAP}")
 
     def of_verb_that_finds_one(self) -> NoCamera:
         """For verbs that take --camera auto."""
         auto = "--camera auto to find it from the motion (--fov 70 where to start)"
-        return NoCamera(self.where, self.found, f"give --camera {_FILE}, {auto}, {_MAP}")
+        return NoCamera(self.where, self.found, f"give {option('camera')} {_FILE}, {auto}, {_MAP}")
 
-    def of_other_verb(self, data: Path | str, option: str = "--camera", maps: bool = True) -> NoCamera:
-        """For verbs that do not: `option` is what their calibration file is given by, `maps` whether they take one."""
+    def of_other_verb(self, data: Path | str, maps: bool = True) -> NoCamera:
+        """For verbs that do not; `maps` whether they take one."""
         first = f"make a sequence with one first: lightdepth import {data} --camera auto -o DATA"
         ways = f"{first}, {_MAP}" if maps else f"or {first}"
-        return NoCamera(self.where, self.found, f"give {option} {_FILE}, {ways}")
+        return NoCamera(self.where, self.found, f"give {option('camera')} {_FILE}, {ways}")

@@ -20,6 +20,7 @@ from lightdepth.files.below import folders_in
 from lightdepth.files.images import image_size
 from lightdepth.files.reading import reading
 from lightdepth.frame import check_image_size
+from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.which_frame import Stamps
 
@@ -138,7 +139,9 @@ def _looks_like(path: Path) -> Format | None:
 def _other_format(path: Path, format: str) -> str:
     """What to try where the format that was named does not fit."""
     other = _looks_like(path)
-    return "" if other is None or other.name == format else f". By its files it looks like --format {other.name}"
+    return (
+        "" if other is None or other.name == format else f". By its files it looks like {option('format')} {other.name}"
+    )
 
 
 def _folders_below(path: Path) -> str:

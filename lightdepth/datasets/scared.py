@@ -43,6 +43,7 @@ from lightdepth.datasets.video_sequence import border_of
 from lightdepth.errors import InputError
 from lightdepth.files.images import decode_raw, image_size, read_raw, unit_range
 from lightdepth.frame import Frame
+from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.pose_readings import AS_GIVEN, INVERSE
 from lightdepth.sparse_map import check_rigid
@@ -130,7 +131,9 @@ def _read_sequence(
     records = {n: (name, _json(blob, name)) for n, name, blob in data.all()} if data is not None else {}
     if camera is None and not records:
         raise InputError(
-            path, "neither data/frame_data.tar.gz nor data/frame_data/", "put it beside the video, or give --camera"
+            path,
+            "neither data/frame_data.tar.gz nor data/frame_data/",
+            f"put it beside the video, or give {option('camera')}",
         )
     numbers = sorted(records) if records else list(range(len(video)))
     if numbers[-1] >= len(video):
@@ -217,7 +220,7 @@ def _from_json(where: str, record: dict[str, Any], view: str) -> _Calibration:
 
 def _read_yaml(path: Path, view: str) -> _Calibration:
     if not path.is_file():
-        raise InputError(path, "no such file", "put the keyframe's there, or give --camera FILE")
+        raise InputError(path, "no such file", f"put the keyframe's there, or give {option('camera')} FILE")
     side = "1" if view == "left" else "2"
     return _calibration(read_matrices(path, (f"M{side}", f"D{side}", "R", "T")), str(path))
 
@@ -260,7 +263,7 @@ def _camera(calibration: _Calibration, width: int, height: int, path: Path) -> C
             raise InputError(
                 path,
                 f"k3 = {distortion[4]:g} cannot be folded into k1, k2, p1, p2: {off:.2g} pixels are left",
-                "undistort the images, or give --camera FILE",
+                f"undistort the images, or give {option('camera')} FILE",
             )
         warnings.warn(
             f"{path}: k3 = {distortion[4]:g} is folded into the other coefficients, off by {off:.2g} pixels",

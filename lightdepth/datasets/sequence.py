@@ -21,6 +21,7 @@ from lightdepth.files.images import ARRAY_SUFFIXES, PICTURE_SUFFIXES, image_size
 from lightdepth.files.masks import read_two_parts
 from lightdepth.files.reading import reading
 from lightdepth.frame import Frame, frame_number
+from lightdepth.option_names import option
 from lightdepth.sparse_map import Keyframe
 
 IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, *ARRAY_SUFFIXES)
@@ -89,9 +90,15 @@ class FrameSequence(Sequence[Frame]):
             return self
         return FrameSequence(self.names, self._load_blind, self.source, self.sampled)
 
+    def first(self) -> Frame:
+        """The first frame that can be read, for what all have in common. Raises InputError, the very first one's, where
+        none of the first hundred can."""
+        found = next((frame for i in range(min(len(self), 100)) for frame in readable(self, [i])), None)
+        return self[0] if found is None else found
+
     def image_size(self) -> tuple[int, int]:
-        """Width and height of the frames; reads the first."""
-        first = self[0]
+        """Width and height of the frames."""
+        first = self.first()
         return first.camera.width, first.camera.height
 
     def by_number(self, number: int) -> Frame | None:
@@ -234,8 +241,8 @@ def warn_of_orientation(source: Path, images: Sequence[Path]) -> None:
 def warn_of_border(source: Path, mask: np.ndarray) -> None:
     """Says that a black border was found, and left out."""
     warnings.warn(
-        f"{source}: {1 - float(mask.mean()):.0%} of the image is a black border, which is left out; give --mask to "
-        "choose another",
+        f"{source}: {1 - float(mask.mean()):.0%} of the image is a black border, which is left out; give "
+        f"{option('mask')} to choose another",
         stacklevel=6,
     )
 

@@ -23,6 +23,7 @@ from lightdepth.datasets.sequence import FrameSequence, numbered_files
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
 from lightdepth.frame import Frame
+from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.regular import regular
 
@@ -61,7 +62,9 @@ def read_simcol(
     if camera is None:
         file = camera_file(path)
         if file is None:
-            raise InputError(path, "no cam.txt here or in the folder above", "put it there, or give --camera FILE")
+            raise InputError(
+                path, "no cam.txt here or in the folder above", f"put it there, or give {option('camera')} FILE"
+            )
         width, height = image_size(images[0])
         # read_camera takes a bare matrix as OpenCV's, with the first centre at (0, 0): undone
         camera = read_camera(file, (width, height)).with_pixel_center(1.0)

@@ -22,5 +22,5 @@ def open_with_map(
         sparse_map = read_map(map, reader)
     except CameraMissing:
         frames = source.open()
-        return read_map(map, Reader(reading, reader.frames, frames[0].camera)), frames
+        return read_map(map, Reader(reading, reader.frames, frames.first().camera)), frames
     return sparse_map, source.open(sparse_map.submaps[0].keyframes[0].camera)

@@ -201,6 +201,6 @@ def _witnesses(submap: Submap, pictures: Pictures, counting: Counting, places: i
 
 def _camera_of(pictures: Pictures) -> CameraModel | None:
     try:
-        return pictures.frames[0].camera
+        return pictures.frames.first().camera
     except InputError:
         return None

@@ -18,6 +18,7 @@ import numpy as np
 from lightdepth.errors import InputError
 from lightdepth.files.headers import Header, header_of
 from lightdepth.files.images import own_white, read_pixels
+from lightdepth.option_names import option
 
 _LOOKED_AT = 8, 64
 """How many pictures are read: the first number, and more of them as long as all are dark."""
@@ -32,7 +33,7 @@ def white_of(images: Sequence[Path], bit_depth: int | None = None) -> float | No
     floats; None where all are of 8 bits. `bit_depth` is what the user says. Raises InputError where it cannot be told.
     """
     if bit_depth is not None and not 1 <= bit_depth <= 32:
-        raise InputError("--bit-depth", f"{bit_depth}", "expected the bits of a sample, from 8 to 32")
+        raise InputError(option("bit-depth"), f"{bit_depth}", "expected the bits of a sample, from 8 to 32")
     deep: dict[Path, Header] = {}
     for image in _spread(images, 256):
         with suppress(InputError, OSError):  # refused by name when it is read
@@ -78,7 +79,7 @@ def _by_pixels(images: Sequence[Path], stated: int | None) -> float | None:
     if bits >= 7 and top == 2**bits - 1 and at_top >= _PLATEAU:
         warnings.warn(
             f"{where}: {dtype} pictures are read as {bits} bits: none of their values is above {top:.0f}, and "
-            f"{at_top} are there; give --bit-depth if they have others",
+            f"{at_top} are there; give {option('bit-depth')} if they have others",
             stacklevel=2,
         )
         return top
@@ -86,7 +87,7 @@ def _by_pixels(images: Sequence[Path], stated: int | None) -> float | None:
         if top < 2**14:
             warnings.warn(
                 f"{where}: the highest value is {top:.0f} of 65535: if these are samples of 14 bits, give "
-                "--bit-depth 14",
+                f"{option('bit-depth')} 14",
                 stacklevel=2,
             )
         return own
@@ -96,12 +97,13 @@ def _by_pixels(images: Sequence[Path], stated: int | None) -> float | None:
             where,
             f"{dtype} pictures whose highest value is {top:.0f}: samples of {least} bits stored as they are, or "
             "pictures that are nearly black",
-            f"give --bit-depth {least}, or --bit-depth {15 if own == 32767 else 16} if they are dark",
+            f"give {option('bit-depth')} {least}, or {option('bit-depth')} {15 if own == 32767 else 16} if they are "
+            "dark",
         )
     raise InputError(
         where,
         f"{dtype} pictures with values up to {top:g}",
-        "expected 0 to 1; give --bit-depth 8 if white is 255, 16 if it is 65535",
+        f"expected 0 to 1; give {option('bit-depth')} 8 if white is 255, 16 if it is 65535",
     )
 
 

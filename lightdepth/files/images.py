@@ -19,6 +19,7 @@ from lightdepth.files.arrays import array_in
 from lightdepth.files.headers import Header, as_stored, header_in, header_of, what_is_there
 from lightdepth.files.machine import FAILS
 from lightdepth.files.reading import check_bytes, check_pixels, reading
+from lightdepth.option_names import option
 
 PICTURE_SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".dib", ".tif", ".tiff", ".webp", ".jp2", ".j2k"),
@@ -48,7 +49,7 @@ def read_image(path: Path, white: float | None = None) -> np.ndarray:
         raise InputError(
             path,
             f"{pixels.dtype} pixels from {low:g} to {high:g}, where black is 0 and white {level:g}",
-            "store the pictures in one way, or give --bit-depth",
+            f"store the pictures in one way, or give {option('bit-depth')}",
         )
     result: np.ndarray = np.minimum(np.divide(pixels, level, dtype=np.float32), np.float32(1))
     return result

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -32,6 +33,12 @@ FAILS = {
 _FULL = 1 << 16
 """A disk with less room than this, in bytes, when a writer failed: then that is why. Libraries do not always say, but
 what they wrote of their file has filled the disk."""
+
+_NUMBER = re.compile(r"\(os error (\d+)\)")
+"""Where libraries in Rust (safetensors) say the number that the system gave; their errors are no OSError."""
+
+_WORDS = {"database or disk is full": errno.ENOSPC, "disk I/O error": errno.EIO}
+"""What SQLite says instead of a number, in errors of sqlite3 and of those who use it."""
 
 _MEMORY = ("can't allocate memory", "out of memory", "Insufficient memory", "Cannot allocate memory", "bad_alloc")
 
@@ -74,6 +81,8 @@ def _reason(error: BaseException, folder: Path | None) -> str | None:
         return "the folder that you are in is gone"
     if isinstance(error, OSError) and error.errno in FAILS:
         return FAILS[error.errno]
+    if (said := _said(error)) in FAILS:
+        return FAILS[said]
     if folder is None or isinstance(error, InputError | PartialFailure) or not isinstance(error, Exception):
         return None
     if not folder.is_dir():
@@ -83,6 +92,14 @@ def _reason(error: BaseException, folder: Path | None) -> str | None:
     except OSError:
         return FAILS[errno.EIO]
     return FAILS[errno.ENOSPC] if full else None
+
+
+def _said(error: BaseException) -> int:
+    """The system's number that a library tells of in words; 0 where it tells of none."""
+    if isinstance(error, InputError | PartialFailure | OSError) or not isinstance(error, Exception):
+        return 0
+    found = _NUMBER.search(str(error))
+    return int(found[1]) if found else next((n for words, n in _WORDS.items() if words in str(error)), 0)
 
 
 def _room(path: Path) -> str:

@@ -67,8 +67,7 @@ def stamp(output: Path) -> Stamp:
 def real_output(output: Path) -> Path:
     """The folder that an output names, links followed. Raises InputError for what can never become a run folder."""
     output = Path(output)
-    if (length := len(os.fsencode(output.name))) > _LONGEST:
-        raise InputError(_short(output), f"its name has {length} bytes", f"expected up to {_LONGEST}")
+    check_name(output)
     try:
         if output.is_symlink() and not output.exists():
             raise InputError(output, "is a link to nothing", "choose another -o, or make the folder that it names")
@@ -84,6 +83,12 @@ def real_output(output: Path) -> Path:
             output, "is the folder that you are in, and cannot be replaced", f"give one in it: -o {output / 'run'}"
         )
     return real
+
+
+def check_name(output: Path) -> None:
+    """Raises InputError where hidden neighbours of an output could not be called after it."""
+    if (length := len(os.fsencode(output.name))) > _LONGEST:
+        raise InputError(_short(output), f"its name has {length} bytes", f"expected up to {_LONGEST}")
 
 
 def try_place(output: Path) -> None:
@@ -195,6 +200,8 @@ def check_files(paths: Iterable[Path], overwrite: bool, inputs: Iterable[Path | 
     for path in paths:
         if path.is_dir():
             raise InputError(path, "is a folder", "expected the name of a file to write")
+        if path.is_symlink() and not path.exists():
+            raise InputError(path, "is a link to nothing", "choose another name, or remove the link")
         if path.exists():
             if not overwrite:
                 raise InputError(path, "already there", "choose another -o, or give --overwrite")

@@ -213,9 +213,7 @@ def _write(path: Path, content: Content) -> None:
     else:
         try:
             content(path)
-        except (OSError, InputError):
-            raise
-        except Exception:
+        except RuntimeError:  # torch.save's, of a full disk; it is the only writer that keeps the system's number back
             _check_room(path)
             raise
 

@@ -63,7 +63,7 @@ def open_source(source: SequenceSource) -> tuple[Source, list[Path]]:
             "expected a video such as .mp4 or .mov, or a folder of frames",
         )
     frames, missing = _sequence(source)
-    first = frames[0]
+    first = frames.first()
 
     def read(i: int) -> tuple[np.ndarray, float]:
         frame = frames[i]

@@ -254,7 +254,7 @@ def fit_assumed_light(
 
     What was fitted, and whether it is used, or why nothing was fitted, is in the run's record as `light_fit`.
     """
-    if not frames[0].light.assumed:
+    if not frames.first().light.assumed:
         return None
     if run.done("light"):
         light_fit, kept = run.kept_of("light")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lightdepth.files.lock import locked
-from lightdepth.files.replacing import check_ours, discard, unfinished_path
+from lightdepth.files.replacing import check_name, check_ours, discard, unfinished_path
 from lightdepth.files.writing import folders_for
 from lightdepth.reporting.run import Run, going_on, kept_or_gone
 from lightdepth.reporting.unfinished import begun_with, clean, finished_parts
@@ -16,7 +16,7 @@ from lightdepth.reporting.unfinished import begun_with, clean, finished_parts
 
 def goes_on(output: Path) -> bool:
     """Whether a run that was stopped has finished parts for the file `output`."""
-    made = unfinished_path(output.resolve())
+    made = unfinished_path(_place(output))
     return begun_with(made) is not None and bool(finished_parts(made))
 
 
@@ -29,7 +29,8 @@ def kept_beside(
     What it is of is noted with `Run.check_inputs`. Raises InputError when the file is being made by another run, or
     parts are there and neither `resume` nor `overwrite` is given, or they are of another run.
     """
-    real = output.resolve()
+    check_name(output)
+    real = _place(output)
     made = unfinished_path(real)
     with folders_for([made]), locked(real):
         check_ours(made, output)
@@ -44,3 +45,8 @@ def kept_beside(
                 run.begin()
             yield run
         discard(made)
+
+
+def _place(output: Path) -> Path:
+    """Where the file comes to stand: in the place of a link that has its name, not of what that leads to."""
+    return output.parent.resolve() / output.name

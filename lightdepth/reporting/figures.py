@@ -145,6 +145,10 @@ class MeshView:
         width, height = size
         if not len(triangles):
             return cls(np.zeros((height, width), bool), np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros(0))
+        # Rays are cast in single precision: near nought, and neither tiny nor huge, wherever the map lies.
+        low, high = vertices.min(0), vertices.max(0)
+        middle, extent = (low + high) / 2, float((high - low).max()) or 1.0
+        vertices = (vertices - middle) / extent
         o3d = native.open3d()
         scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32)))
@@ -154,7 +158,7 @@ class MeshView:
         else:
             directions = np.stack([u / focal, v / focal, np.ones_like(u)], -1) @ axes
             directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-            origins = np.broadcast_to(origin, directions.shape)
+            origins = np.broadcast_to((origin - middle) / extent, directions.shape)
         hit = scene.cast_rays(o3d.core.Tensor(np.concatenate([origins, directions], -1).astype(np.float32)))
         met = np.isfinite(hit["t_hit"].numpy())
         weights = hit["primitive_uvs"].numpy()[met]
@@ -172,14 +176,20 @@ class MeshView:
 
 def _outside(vertices: np.ndarray, u: np.ndarray, v: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
     """Parallel rays onto the mesh's broad side, a little from above."""
-    middle = vertices.mean(0)
-    sample = vertices[:: max(1, len(vertices) // 20000)] - middle
-    long, across, thin = np.linalg.svd(sample, full_matrices=False)[2]
+    sample = vertices[:: max(1, len(vertices) // 20000)]
+    middle = sample.mean(0)
+    sample = sample - middle
+    axes = np.linalg.svd(sample, full_matrices=False)[2]
+    axes *= np.sign(axes[range(3), np.abs(axes).argmax(1)])[:, None]  # else rounding decides which side is seen
+    long, across, thin = axes
     forward = thin + 0.45 * across
     forward /= np.linalg.norm(forward)
     right = long
     down = np.cross(forward, right)
-    reach = np.abs(sample @ np.stack([right, down, forward]).T)
-    extent = 2.1 * max(np.quantile(reach[:, 0], 0.995), np.quantile(reach[:, 1], 0.995) / aspect)
-    origins = middle + extent * (u[..., None] * right + v[..., None] * down) - 2 * reach[:, 2].max() * forward
+    place = sample @ np.stack([right, down, forward]).T
+    low, high = np.quantile(place, (0.001, 0.999), axis=0)
+    middle = middle + (low + high)[:2] / 2 @ np.stack([right, down])
+    extent = 1.05 * max((high - low)[0], (high - low)[1] / aspect)
+    behind = 2 * float(np.abs(place[:, 2]).max()) + 0.1  # of a flat mesh too the rays begin before it
+    origins = middle + extent * (u[..., None] * right + v[..., None] * down) - behind * forward
     return origins, np.broadcast_to(forward, origins.shape)

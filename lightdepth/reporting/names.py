@@ -21,6 +21,7 @@ from lightdepth.command_line.config_words import configs
 from lightdepth.files.named_inputs import INPUTS, real_inputs
 from lightdepth.files.replacing import BEGUN, PARTS, STATE
 from lightdepth.files.writing import PARTIAL
+from lightdepth.foreign_text import for_line, for_terminal
 from lightdepth.reporting.same import input_hash
 
 OUTPUT = "OUT"
@@ -275,7 +276,9 @@ def _replacing(forms: Mapping[str, str], before: str, relative: str, after: str)
         in_json = json.dumps(form)[1:-1]
         in_yaml = re.sub(r"\\u00([0-9a-f]{2})", lambda found: rf"\x{found[1].upper()}", in_json)
         shown = form.encode("utf-8", "backslashreplace").decode()
-        for text in (form, html.escape(form), html.escape(shown), in_json, in_yaml, shown, form.replace("_", r"\_")):
+        said = for_terminal(form), for_line(form)
+        in_html = (html.escape(each) for each in (form, shown, *said))
+        for text in (form, *in_html, in_json, in_yaml, shown, *said, form.replace("_", r"\_")):
             spelled.setdefault(text, name)
     if not spelled:
         return lambda text: text

@@ -42,17 +42,17 @@ def write_run_json(
     record: Mapping[str, Any],
     names: Names = _NO_NAMES,
 ) -> None:
-    """run.json, by rename, so that its presence means that the run is complete. `start` as of time.time(); `names` are
-    what inputs are called in it."""
-    told = plain(record)
+    """run.json, by rename, so that its presence means that the run is complete. `start` as of time.monotonic(), which
+    no clock that is set back moves; `names` are what inputs are called in it."""
+    told, seconds = plain(record), time.monotonic() - start
     data = {
         "verb": verb,
         "arguments": names.hidden(plain(arguments), exactly=True),
         "command": names.command([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "versions": versions(),
         "revision": git_revision(),
-        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start)),
-        "seconds": round(time.time() - start, 3),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(time.time() - seconds)),
+        "seconds": round(seconds, 3),
         "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
         **{key: names.hidden(value, exactly=key == "inputs") for key, value in told.items()},
         "files": listed(folder),

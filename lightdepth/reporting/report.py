@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from lightdepth.foreign_text import for_terminal
+
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd; }
@@ -15,6 +17,7 @@ table { border-collapse: collapse; margin: .8rem 0; } th, td { padding: .25rem .
 th { border-bottom: 2px solid #888; font-weight: 600; } td { border-bottom: 1px solid #e5e5e5; }
 th:first-child, td:first-child { text-align: left; } td.text, th.text { text-align: left; }
 figure { margin: 1rem 0; } figure img { max-width: 100%; } figcaption { color: #555; font-size: .9rem; }
+h1, h2, p, figcaption { overflow-wrap: anywhere; }  td.text { overflow-wrap: anywhere; min-width: 5rem; }
 .figures { display: flex; flex-wrap: wrap; gap: 1rem; } .figures figure { margin: 0; flex: 1 1 300px; }
 """
 
@@ -24,19 +27,19 @@ class Report:
 
     def __init__(self, title: str):
         self._title = title
-        self._parts = [f"<h1>{html.escape(title)}</h1>"]
+        self._parts = [f"<h1>{_shown(title)}</h1>"]
 
     def heading(self, text: str) -> None:
-        self._parts.append(f"<h2>{html.escape(text)}</h2>")
+        self._parts.append(f"<h2>{_shown(text)}</h2>")
 
     def text(self, text: str) -> None:
-        self._parts.append(f"<p>{html.escape(text)}</p>")
+        self._parts.append(f"<p>{_shown(text)}</p>")
 
     def table(self, headers: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Numbers are shown with three significant digits; give strings where that is not wanted."""
         of_words = [bool(rows) and isinstance(rows[0][i], str) for i in range(len(headers))]
         classes = [' class="text"' if words else "" for words in of_words]
-        head = "".join(f"<th{c}>{html.escape(h)}</th>" for h, c in zip(headers, classes, strict=True))
+        head = "".join(f"<th{c}>{_shown(h)}</th>" for h, c in zip(headers, classes, strict=True))
         body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
         self._parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
 
@@ -49,7 +52,7 @@ class Report:
         self._parts += [_figure(*p) for p in pictures]
 
     def write(self, path: Path) -> None:
-        head = f'<meta charset="utf-8"><title>{html.escape(self._title)}</title><style>{_STYLE}</style>'
+        head = f'<meta charset="utf-8"><title>{_shown(self._title)}</title><style>{_STYLE}</style>'
         path.write_text(
             f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(self._parts)}</body></html>\n",
             encoding="utf-8",
@@ -57,15 +60,20 @@ class Report:
         )
 
 
+def _shown(text: str) -> str:
+    """A text in which names of strangers are neither markup nor turn the direction of writing round."""
+    return html.escape(for_terminal(text))
+
+
 def _figure(data: bytes, caption: str) -> str:
     source = base64.b64encode(data).decode()
-    text = html.escape(caption)
+    text = _shown(caption)
     return f'<figure><img alt="{text}" src="data:image/png;base64,{source}"><figcaption>{text}</figcaption></figure>'
 
 
 def _cell(value: Any) -> str:
     if isinstance(value, str):
-        return f'<td class="text">{html.escape(value)}</td>'
+        return f'<td class="text">{_shown(value)}</td>'
     return f"<td>{number(value)}</td>"
 
 

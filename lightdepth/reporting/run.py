@@ -33,10 +33,10 @@ from lightdepth.files.replacing import (
     unfinished_path,
 )
 from lightdepth.files.writing import folders_for, sync_below, usual_mode
-from lightdepth.foreign_text import for_terminal
+from lightdepth.foreign_text import for_line, for_terminal
 from lightdepth.reporting.names import KEPT, Names, names_of, spoken
 from lightdepth.reporting.record import write_run_json
-from lightdepth.reporting.same import check_finished, check_same, compared, own_version
+from lightdepth.reporting.same import check_finished, check_same, compared, fingerprint, own_version
 from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
 from lightdepth.reporting.same import plain as plain
@@ -70,7 +70,7 @@ class Run:
         self.resumed = bool(parts)
         self._told: set[str] = set()  # finished parts whose reports are in the record
         self._begun: dict[str, tuple[int, int]] = {}  # failures and warnings when a part began: parts may lie in parts
-        self._verb, self._given, self._start = verb, arguments, time.time()
+        self._verb, self._given, self._start = verb, arguments, time.monotonic()
         self._arguments = plain(arguments)
         self.keep_names = False
         self._say: Callable[[str], str] | None = None
@@ -123,24 +123,27 @@ class Run:
         return (self.parts or {})[part].kept
 
     def log(self, message: str) -> None:
-        """A line for log.txt, and for the user, who reads the names of options in the place of their paths."""
-        self._say = self._say or (str if self.keep_names else spoken(self._given))
-        print(for_terminal(self._say(message)), flush=True)
-        self._note(message)
+        """Lines for log.txt, and for the user, who reads the names of options in the place of their paths."""
+        self._tell(message, for_terminal)
 
-    def _note(self, message: str) -> None:
+    def _tell(self, message: str, shown: Callable[[str], str]) -> None:
+        self._say = self._say or (str if self.keep_names else spoken(self._given))
+        print(shown(self._say(message)), flush=True)
+        self._note(message, shown)
+
+    def _note(self, message: str, shown: Callable[[str], str] = for_line) -> None:
         with (self.folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(f"{time.strftime('%H:%M:%S')} {for_terminal(message)}\n")
+            file.write(f"{time.strftime('%H:%M:%S')} {shown(message)}\n")
 
     def fail(self, what: str, reason: str) -> None:
         """Part of the work failed; the rest goes on (exit code 4 at the end)."""
         self.record["failures"].append({"what": what, "reason": reason})
-        self.log(f"failed: {what}: {reason}")
+        self._tell(f"failed: {what}: {reason}", for_line)
 
     def warn(self, message: str) -> None:
         """Something is doubtful; the work goes on. It is in the log and in run.json."""
         self.record["warnings"].append(message)
-        self.log(f"warning: {message}")
+        self._tell(f"warning: {message}", for_line)
 
     def warn_once(self, message: str) -> None:
         """As warn, unless that was said before."""
@@ -152,10 +155,13 @@ class Run:
         self.record.setdefault("inputs", {}).update(self._hashed(paths))
         self._note_inputs(self.record["inputs"])
 
-    def check_inputs(self, **paths: Path | None) -> None:
-        """As hash_inputs, for a verb that does not tell the names of files: run.json says nothing of them."""
+    def check_inputs(self, **paths: Path | None) -> str:
+        """As hash_inputs, for a verb that does not tell the names of files: run.json says nothing of them. Returns the
+        `fingerprint` of the run."""
         # By no name of an argument: the arguments of such a verb have no paths.
-        self._note_inputs(self._hashed({f"the {name}": path for name, path in paths.items()}))
+        found = self._hashed({f"the {name}": path for name, path in paths.items()})
+        self._note_inputs(found)
+        return fingerprint(self._verb, self._given, found)
 
     def _hashed(self, paths: Mapping[str, Path | None]) -> dict[str, dict[str, str]]:
         found = {}

@@ -51,7 +51,7 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
     if (version := begun.get("version", own_version())) != own_version():
         found = f"not resumed, it was begun by version {version}, and this is {own_version()}"
         raise InputError(output, found, "go on with that version, or give --overwrite to start anew")
-    now, then = compared(arguments), compared(begun.get("arguments") or {})
+    now, then = _one_by_one(compared(arguments)), _one_by_one(compared(begun.get("arguments") or {}))
     for name in dict.fromkeys([*now, *then]):
         if now.get(name) != then.get(name):
             if isinstance(then.get(name), str) and TOKEN.fullmatch(then[name]):
@@ -65,6 +65,29 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
         path = Path(str(arguments.get(name) or known.get("path") or ""))
         if "sha256" in known and not (path.exists() and input_hash(path, output) == known["sha256"]):
             raise InputError(output, f"not resumed, {name} has changed since", "--overwrite starts anew")
+
+
+def _one_by_one(arguments: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Each option by its name, those of a group as the command line has them: sift.features."""
+    found: dict[str, Any] = {}
+    for name, value in arguments.items():
+        inner = isinstance(value, Mapping) and bool(value)
+        found |= _one_by_one(value, f"{above}{name}.") if inner else {f"{above}{name}": value}
+    return found
+
+
+def fingerprint(verb: str, arguments: Mapping[str, Any], inputs: Mapping[str, Mapping[str, str]]) -> str:
+    """Sixteen digits that are the same for runs of one version with the same options on inputs of the same contents,
+    whatever these are called. `inputs` have the path and the SHA-256 of each."""
+    hashes = {known["path"]: known["sha256"] for known in inputs.values()}
+
+    def by_contents(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: by_contents(each) for name, each in value.items()}
+        return hashes.get(value, value) if isinstance(value, str) else value
+
+    said = json.dumps([own_version(), verb, by_contents(compared(arguments))])
+    return hashlib.sha256(said.encode()).hexdigest()[:16]
 
 
 def own_version() -> str:

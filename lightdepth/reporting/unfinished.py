@@ -1,13 +1,16 @@
 """What a run that can be resumed notes while it goes: what it was begun with, and which parts of it are finished.
 
 `begun.json` is written once, `parts.jsonl` has a line for each finished part, brought to the disk after the part's
-files. A line that is torn counts as not written. Both are gone from the finished run.
+files. Every line ends in a seal, a hash of what it says and of the seal before it: a line that is torn, damaged or gone
+counts as not written, and so do all behind it, which may go on from what it said. Both are gone from the finished run.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,6 +20,8 @@ from lightdepth.files.replacing import BEGUN, PARTS, below
 from lightdepth.files.writing import sync, write_whole
 
 LOG = "log.txt"
+
+_SEAL = re.compile(rb'"seal": "([0-9a-f]{16})"}\n$')
 
 
 @dataclass(frozen=True)
@@ -60,8 +65,9 @@ def add_part(folder: Path, part: Part, files: Iterable[Path]) -> None:
         places.add(file.parent)
     for place in places:
         sync(place)
+    before = _last_seal(folder / PARTS)
     with (folder / PARTS).open("a", encoding="utf-8", errors="surrogateescape") as out:
-        out.write(json.dumps(asdict(part)) + "\n")
+        out.write(_sealed(part, before)[0])
         out.flush()
         os.fsync(out.fileno())
 
@@ -76,13 +82,19 @@ def finished_parts(folder: Path) -> dict[str, Part]:
     except OSError:
         return {}
     parts: dict[str, Part] = {}
+    seal = ""
     for line in lines[:-1]:  # what follows the last end of a line is torn
         try:
-            part = Part(**json.loads(line))
+            said = json.loads(line)
+            said.pop("seal")
+            part = Part(**said)
+            again, seal = _sealed(part, seal)
+            if again != f"{line}\n":
+                break
             if all(_size(folder / name) == size for name, size in part.files.items()):
                 parts[part.name] = part
-        except (ValueError, TypeError, AttributeError, RecursionError):
-            continue
+        except (ValueError, TypeError, AttributeError, KeyError, RecursionError):
+            break
     return parts
 
 
@@ -96,8 +108,11 @@ def clean(folder: Path, parts: Mapping[str, Part]) -> None:
                 path.unlink()
         if place != str(folder) and not any(Path(place).iterdir()):
             os.rmdir(place)
-    lines = "".join(json.dumps(asdict(part)) + "\n" for part in parts.values())
-    write_whole(folder / PARTS, lines)
+    lines, seal = [], ""
+    for part in parts.values():
+        line, seal = _sealed(part, seal)
+        lines.append(line)
+    write_whole(folder / PARTS, "".join(lines))
 
 
 def new_files(folder: Path, known: Iterable[str]) -> dict[str, int]:
@@ -111,6 +126,24 @@ def new_files(folder: Path, known: Iterable[str]) -> dict[str, int]:
             if inside not in past:
                 found[inside] = path.stat().st_size
     return found
+
+
+def _sealed(part: Part, before: str) -> tuple[str, str]:
+    """The line of a part, and its seal; `before` is the seal of the line before it."""
+    said = asdict(part)
+    seal = hashlib.sha256(f"{before}{json.dumps(said)}".encode()).hexdigest()[:16]
+    return f"{json.dumps({**said, 'seal': seal})}\n", seal
+
+
+def _last_seal(path: Path) -> str:
+    """The seal of the last line that was written; empty where there is none."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - 64))
+            found = _SEAL.search(file.read())
+    except OSError:
+        return ""
+    return "" if found is None else found[1].decode()
 
 
 def _size(path: Path) -> int | None:

@@ -18,7 +18,7 @@ from jsonargparse import ArgumentParser
 from lightdepth.checkpoint import load_model
 from lightdepth.errors import PartialFailure
 from lightdepth.files.writing import write_whole
-from lightdepth.foreign_text import for_terminal
+from lightdepth.foreign_text import for_line
 from lightdepth.models import NetworkModel
 from lightdepth.reporting.run import plain
 
@@ -108,4 +108,4 @@ class _Curve(pl.Callback):
 
 def say(line: str) -> None:
     """A line for the terminal."""
-    print(for_terminal(line), file=sys.stderr, flush=True)
+    print(for_line(line), file=sys.stderr, flush=True)

@@ -128,7 +128,7 @@ def _ablate(
     arguments: Mapping[str, object],
 ) -> list[Result]:
     """Trains what is not in the folder yet, and writes the table; the trainings that failed."""
-    started = time.time()
+    started = time.monotonic()
     parser = training_parser()
     parser.exit_on_error = False
     plans = plans_of(parser, output, base, settings or {}, rows, judged, seeds)

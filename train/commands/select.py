@@ -24,7 +24,7 @@ from lightdepth.datasets.with_map import open_with_map
 from lightdepth.errors import AlreadyFinished, InputError
 from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import Content, write_together
-from lightdepth.foreign_text import for_table, for_terminal
+from lightdepth.foreign_text import for_line, for_table
 from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
 from lightdepth.ranges import Range, checked
@@ -124,7 +124,8 @@ def select(
         raise InputError("--resume, --overwrite", "they contradict each other", "give one of them")
     paths, going_on = _paths(output), resume and goes_on(output)
     # A run that goes on may have been begun by --overwrite; one that is finished is looked at before it is refused.
-    check_files(paths.values(), overwrite or going_on or (resume and output.is_file()), [data, map, camera, mask])
+    replacing = overwrite or going_on or (resume and output.is_file())
+    check_files(paths.values(), replacing, [data, map, camera, mask])
     if output.resolve().parent == data.resolve() and not no_frames and any(c.isdigit() for c in output.stem):
         found = f"{paths['sheet'].name}, among the frames, would be taken for one: it has a number"
         raise InputError("-o", found, "choose a name without digits, another folder, or --no-frames")
@@ -135,9 +136,9 @@ def select(
     shown, header = told(str(data), data=data, map=map), [told(line, data=data, map=map) for line in way.header]
     arguments = recorded(source, config, reading, output=output, map=map, with_folder=with_folder, no_frames=no_frames)
     with kept_beside(output, "select", arguments, overwrite, resume) as run:
+        made_by = run.check_inputs(**source.files, map=map, weights=config.loftr.weights)
         if resume and not run.resumed and output.is_file():
-            _check_finished(output, shown, header)
-        run.check_inputs(**source.files, map=map)
+            _check_finished(paths, made_by, no_frames)
         doubts = colours_of(frames).doubts
         for doubt in doubts:
             warnings.warn(f"{data}: {doubt}", stacklevel=2)
@@ -150,8 +151,9 @@ def select(
             )
         summary = f"{sum(v.kept for v in verdicts)} of {len(verdicts)} frames kept; rejected: {_counts(verdicts)}"
         folder = f"{data.resolve().name}/" if with_folder else ""
-        listed = [_comment(line) for line in (f"{shown}: {summary}", *header)]
-        listed += [f"{folder}{v.name}" for v in verdicts if v.kept]
+        chosen = [f"{folder}{v.name}" for v in verdicts if v.kept]
+        listed = [_comment(line) for line in (f"{shown}: {summary}", *header, _ending(made_by, len(chosen)))]
+        listed += chosen
         picture = None if no_frames else _sheet(frames, verdicts)
         doubts = tuple(told(doubt, data=data, map=map) for doubt in doubts)
         writers: dict[Path, Content] = {
@@ -161,10 +163,11 @@ def select(
         }
         if picture is not None:
             writers = {paths["sheet"]: picture, **writers}
+        check_files(writers, replacing)  # a run to list.md writes list.csv too
         write_together(writers)
         if no_frames:
             paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
-    print(for_terminal(f"{summary}\n{', '.join(str(path) for path in writers)}"))
+    print(f"{summary}\n{for_line(', '.join(str(path) for path in writers))}")
 
 
 @dataclass(frozen=True)
@@ -194,13 +197,25 @@ def _comment(line: str) -> str:
     return f"# {' '.join(line.split())}"
 
 
-def _check_finished(output: Path, shown: str, header: Sequence[str]) -> None:
-    """Raises AlreadyFinished where the list is of these frames and settings, else InputError."""
-    lines = output.read_text(encoding="utf-8", errors="replace").splitlines()
-    said = [line for line in lines if line.startswith("#")]
-    if said[:1] and said[0].startswith(f"# {shown}: ") and said[1:] == [_comment(line) for line in header]:
-        raise AlreadyFinished(f"{output.name} is already finished")
-    raise InputError(output, "not resumed, it is of other frames or settings", "choose another -o, or --overwrite")
+def _ending(made_by: str, count: int) -> str:
+    """The last line before the names, by which a finished list is known again."""
+    return f"run {made_by}, {count} names follow"
+
+
+def _check_finished(paths: Mapping[str, Path], made_by: str, no_frames: bool) -> None:
+    """Raises AlreadyFinished where the list is whole, of these frames and settings, and all is there that belongs to
+    it, else InputError."""
+    output, cure = paths["list"], "choose another -o, or give --overwrite to start anew"
+    lines = output.read_text(encoding="utf-8", errors="replace").split("\n")
+    said = [line for line in lines if line.startswith("# run ")]
+    if not said or not said[-1].startswith(f"# run {made_by}, "):
+        raise InputError(output, "not resumed, it is of other frames or settings", cure)
+    if said[-1] != _comment(_ending(made_by, sum(bool(line) and not line.startswith("#") for line in lines))):
+        raise InputError(output, "not resumed, it is finished, but was changed since", cure)
+    for what, path in paths.items():
+        if not path.is_file() and not (what == "sheet" and no_frames):
+            raise InputError(output, f"not resumed, it is finished, but {path.name} beside it is gone", cure)
+    raise AlreadyFinished(f"{output.name} is already finished")
 
 
 def _kept(run: Run, way: _Way) -> list[FrameVerdict]:
