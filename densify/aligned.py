@@ -19,6 +19,8 @@ from lightdepth.sparse_map import Keyframe, Submap
 
 _MOST_DOUBTED = 0.5  # share of a submap's keyframes that may be left out; where more are doubted, the wall is as it is
 
+_FINER_ROUNDS = 3  # from fields that agree: more change them by about a thousandth
+
 
 @dataclass(frozen=True)
 class AlignedKeyframe:
@@ -84,8 +86,8 @@ def bent_finer(keyframes: Sequence[AlignedKeyframe], shared: np.ndarray, config:
     rows = [i for i, each in enumerate(keyframes) if each.view is not None and each.bend is not None and each.alone]
     views = [view for i in rows if (view := keyframes[i].view) is not None]
     start = [bend.with_finer() for i in rows if (bend := keyframes[i].bend) is not None]
-    finer = config.bending.with_finer()
-    bends = agree(views, shared[np.ix_(rows, rows)], config.agreement, finer, start) if rows else []
+    finer, agreement = config.bending.with_finer(), replace(config.agreement, rounds=_FINER_ROUNDS)
+    bends = agree(views, shared[np.ix_(rows, rows)], agreement, finer, start) if rows else []
     return {keyframes[i].keyframe.name: bend for i, bend in zip(rows, bends, strict=True)}
 
 

@@ -64,7 +64,8 @@ class Judge:
         return self._config.judge.on and bool(self._look())
 
     def refined(self, keyframes: Sequence[AlignedKeyframe], finer: Mapping[str, Bend]) -> list[AlignedKeyframe]:
-        """The same keyframes, with as much of what a finer grid adds to their bends as the images speak for."""
+        """The same keyframes, with as much of what a finer grid adds to their bends as the images speak for. Blocks of
+        wall are hidden from alignments without it."""
         errors = [np.zeros((0, 2))]
         for k in keyframes:
             if k.keyframe.name in finer and k.bend is not None:
@@ -72,15 +73,14 @@ class Judge:
         share = kept_of_finer(np.concatenate(errors))
         if share == 0:
             return list(keyframes)
-        if share >= 0.5:
-            self._method = replace(self._method, bending=self._config.bending.with_finer())
         return [self._mixed(k, finer[k.keyframe.name], share) if k.keyframe.name in finer else k for k in keyframes]
 
     def _mixed(self, k: AlignedKeyframe, finer: Bend, share: float) -> AlignedKeyframe:
         assert k.bend is not None and k.alone is not None and k.view is not None
         coarse = k.bend.with_finer()
         mixed = replace(coarse, weights=coarse.weights + share * (finer.weights - coarse.weights))
-        return replace(k, bend=mixed, alignment=bent(k.alone, mixed, k.view.observed, self._config.alignment))
+        alignment = bent(k.alone, mixed, k.view.observed, self._config.alignment)
+        return replace(k, bend=mixed, alignment=alignment) if alignment.bend is not None else k
 
     def braked(self, keyframes: Sequence[AlignedKeyframe]) -> list[AlignedKeyframe]:
         """The same keyframes, each with as much of its bend as makes things better, and the reason for less."""
