@@ -210,15 +210,15 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
         j = result.judgement
         if j is None:
             continue
-        text = f"Map {result.dense.submap.id}: {j.verdict}."
+        said = [f"{result.verdict}."] if len(results) > 1 else []  # a single one is said above
         if j.surface is not None:
-            met = "" if j.surface.median_met is None else f" {100 * j.surface.median_met:.1f} % in the median;"
-            text += f" The surface against the images:{met} {100 * j.surface.miss:.0f} % of their rays miss it."
+            said.append(f"{100 * j.surface.miss:.0f} % of the images' rays miss the surface.")
         braked = [a for a in result.dense.alignments if a.unbent_because]
         if braked:
-            text += f" {j.undone} keyframes keep one scale, {j.lessened} a part of their bend; "
-            text += f"{braked[0].keyframe}: {braked[0].unbent_because}."
-        page.text(text)
+            kept = f"{j.undone} keyframes keep one scale, {j.lessened} a part of their bend"
+            said.append(f"{kept}; {braked[0].keyframe}: {braked[0].unbent_because}.")
+        if said:
+            page.text(f"Map {result.dense.submap.id}: {' '.join(said)}")
 
 
 def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:

@@ -72,7 +72,7 @@ def demo(
         evaluation = judge_maps(dense_models(read_run(run.folder)), read_truth(data))
         run.log(write_evaluations({"demo": evaluation}, run.folder))
         run.record["evaluation"] = [found.record() for found in evaluation.judged.maps]
-        notes = [f"Verdict: {work.verdict}."] if work.verdict is not None else []
+        notes = [f"Verdict: {work.headline}."] if work.headline else []
         notes += [
             f"A synthetic colon (seed {seed}), {frames} frames, a simulated SLAM export of {len(sparse_map.submaps)} "
             f"submaps with {spurious:.0%} wrong points; depth by {work.model}. Truth is exact, so errors are errors.",
