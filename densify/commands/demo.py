@@ -15,6 +15,7 @@ from densify.page import densify_page
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import open_sequence
+from lightdepth.errors import InputError
 from lightdepth.maps import read_map
 from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
 from lightdepth.reporting.progress import Progress
@@ -22,7 +23,7 @@ from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import Lens, render_sequence
 from lightdepth.tube import lens as tube_lens
 from lightdepth.tube.export import write_synthetic
-from lightdepth.tube.slam import SlamConfig, simulate_slam
+from lightdepth.tube.slam import SlamConfig, least_frames, simulate_slam
 
 
 def demo(
@@ -57,13 +58,18 @@ def demo(
         lens=lens,
         spurious=spurious,
     )
+    config = SlamConfig("independent", spurious=spurious)
+    least = least_frames(config, seed)
+    if frames < least:
+        found = f"{frames}, too few for {config.maps} submaps of two keyframes each"
+        raise InputError("--frames", found, f"expected at least {least}")
     model = predicting.load(details=False)
     with run_folder(output, "demo", arguments, overwrite) as run:
         with Progress("Rendering", frames) as bar:
             sequence = render_sequence(
                 seed, frames, tube_lens(lens, *size), 0.7 * frames, progress=lambda *_: bar.advance()
             )
-        slam = simulate_slam(sequence.frames, SlamConfig("independent", spurious=spurious), seed)
+        slam = simulate_slam(sequence.frames, config, seed)
         write_synthetic(sequence.frames, slam, run.folder / "data")
         data = open_sequence(run.folder / "data")
         sparse_map = read_map(run.folder / "data" / "slam")
