@@ -7,6 +7,7 @@ from typing import Annotated
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
+from densify.evaluation.in_short import in_short
 from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import dense_models, read_run
 from densify.evaluation.tables import write_evaluations
@@ -76,7 +77,8 @@ def demo(
         work = Densified.make(data, sparse_map, model, DensifyConfig())
         work.write(run, ("ply",), None)
         evaluation = judge_maps(dense_models(read_run(run.folder)), read_truth(data))
-        run.log(write_evaluations({"demo": evaluation}, run.folder))
+        write_evaluations({"demo": evaluation}, run.folder)
+        run.log(in_short({"demo": evaluation}))
         run.record["evaluation"] = [found.record() for found in evaluation.judged.maps]
         notes = [f"Verdict: {work.headline}."] if work.headline else []
         notes += [

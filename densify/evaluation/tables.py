@@ -271,7 +271,7 @@ def write_evaluations(
     sources: Sources | None = None,
     suite: Suite | None = None,
 ) -> str:
-    """Everything, into the folder; the text of the tables."""
+    """Everything, into the folder; the text of the tables, as metrics.md has it."""
     record = metrics_record(found, withheld, sources)
     (folder / "metrics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     results = {name: e.judged for name, e in found.items()}
@@ -337,12 +337,15 @@ def _notes(results: Mapping[str, DepthJudged | MapsJudged], gap: MapGap | None) 
             notes.append(f"Alignment: {judged.alignment}. CLiMB: {judged.trajectory.climb_rule}.\n")
             if judged.trajectory.localised_share is None:
                 notes.append(f"Share of frames localised {judged.trajectory.localised_of}.\n")
-    if gap is not None:
-        notes.append(
-            f"Maps {gap.first} and {gap.second}: gap median {gap.gap.median:.2%}, 90th percentile {gap.gap.p90:.2%} of "
-            f"the distance to the camera, over {gap.gap.rays} rays.\n"
-        )
-    return notes
+    return notes if gap is None else [*notes, gap_note(gap)]
+
+
+def gap_note(gap: MapGap) -> str:
+    """The gap between two submaps in a sentence."""
+    return (
+        f"Maps {gap.first} and {gap.second}: gap median {gap.gap.median:.2%}, 90th percentile {gap.gap.p90:.2%} of "
+        f"the distance to the camera, over {gap.gap.rays} rays.\n"
+    )
 
 
 def long_rows(results: Mapping[str, DepthJudged | MapsJudged]) -> list[list[Cell]]:
