@@ -231,8 +231,9 @@ def withheld_table(withheld: Sequence[WithheldOfMap]) -> Table:
             if found is not None:
                 rows.append([where, name, found.points, found.median, found.p90, found.miss])
     title = (
-        "Agreement with the sparse map: |distance - point| / point along the ray, at points that were hidden from the "
-        "alignment; no truth needed, and no error either."
+        "Agreement with the sparse map: |distance - point| / point along the ray, of each keyframe's depth as it was "
+        "delivered to the surface, at points in blocks of wall that were hidden from the alignment (densify's log has the "
+        "median); no truth needed, and no error either."
     )
     return Table(title, ["Map", "Depth", "Points", "Median", "90th percentile", "Share that misses"], rows)
 

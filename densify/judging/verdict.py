@@ -72,15 +72,13 @@ class Judgement:
 
     @property
     def summary(self) -> str:
-        """Both agreements in a few words, with the constant distance's under the same help."""
-        told = [f"agreement with the map {self._beside(self.blocks)}"]
+        """How far the depth of single keyframes, before it is fused, is from hidden blocks of the map, as `evaluate`
+        has it, and from the images; with the constant distance's under the same help."""
+        mapped = [float("inf") if w is None else w.median for w in (self.hidden, self.hidden_constant)]
+        told = f"single keyframes' depth is {_beside(*mapped)} from hidden blocks of the map"
         if self.images.count:
-            told.append(f"with the images {self._beside(self.images)}")
-        return ", ".join(told)
-
-    @staticmethod
-    def _beside(columns: Columns) -> str:
-        return f"{_share(columns.best)} (a constant distance {_share(columns.constant)})"
+            told += f", {_beside(self.images.best, self.images.constant)} from the images"
+        return told
 
     def record(self) -> dict[str, object]:
         """For run.json."""
@@ -255,6 +253,10 @@ def _no_merit(columns: Columns) -> list[str]:
         return []
     against = f"({_share(columns.constant)} against {_share(columns.best)})"
     return [f"the light adds nothing here: a constant distance does as well {against}"]
+
+
+def _beside(value: float, constant: float) -> str:
+    return f"{_share(value)} (a constant distance {_share(constant)})"
 
 
 def _share(value: float) -> str:
