@@ -60,3 +60,11 @@ def test_what_few_images_show_or_a_small_part_of_the_border_is_left():
 def test_a_rim_that_shines_in_some_images_alone_is_left():
     images, _ = with_rim(frames(), 4, 0.95)
     assert not rim_of_glare([*images[:5], 0.3 * frames()[5]], CIRCLE).any()
+
+
+def test_a_bright_band_that_is_not_as_wide_on_all_sides_is_wall():
+    angle = np.arctan2(ROWS - 128, COLUMNS - 160)
+    depth = cv2.distanceTransform(CIRCLE.astype(np.uint8), cv2.DIST_L2, 5)
+    band = CIRCLE & (depth <= 5 + 4 * np.sin(5 * angle))
+    images = [np.where(band[..., None], np.float32(0.95), image).astype(np.float32) for image in frames()]
+    assert not rim_of_glare(images, CIRCLE).any()

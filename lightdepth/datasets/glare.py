@@ -18,6 +18,7 @@ _AROUND = 0.4  # of the sectors that have a border, that must have a rim
 _PALE = 0.2  # saturation, above which it is tissue
 _BRIGHT = 0.45  # of the darkest channel, in every image
 _DROP, _TINGED = 0.65, 0.15  # that channel falls to such a share where the rim ends, or saturation rises by so much
+_UNLIKE = 0.25  # of the rim's usual width, by which a sector's may differ
 _NEAR, _FEW = 3, 3  # sectors to either side of one that take it along, where so many of them have a rim
 _WIDEST, _EDGE, _BEGINS, _MARGIN = 0.04, 0.012, 0.012, 0.004  # of the image's height
 
@@ -44,6 +45,9 @@ def rim_of_glare(images: Sequence[np.ndarray], region: np.ndarray) -> np.ndarray
         for values in (low.min(0), np.median(low, 0), pale)
     )
     ends = np.array([_end(*profiles, height) for profiles in zip(darkest, typical, saturation, strict=True)])
+    if (ends > 0).any():  # a rim is as wide on one side as on the other, within a pixel or two
+        usual = np.median(ends[ends > 0])
+        ends[np.abs(ends - usual) > max(1.5, _UNLIKE * usual)] = 0
     bordered = np.isfinite(typical[:, 1])
     if not bordered.any() or (ends > 0).sum() < _AROUND * bordered.sum():
         return nothing
