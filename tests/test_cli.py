@@ -310,7 +310,7 @@ BAD_INPUT = {
     "mask": (["predict", "DATA", "--mask", "NOWHERE", "--checkpoint", "decline"], "nowhere: no such mask"),
     "frames": (["synth", "--frames", "0"], "--frames: 0; expected a number from 1"),
     "no pixels": (["synth", "--size", "[0, 0]"], "--size: [0, 0]; expected each number"),
-    "too few frames": (["synth", "--frames", "2", "--size", "[24, 20]"], "render more frames"),
+    "too few frames": (["synth", "--frames", "2", "--size", "[24, 20]"], "at least 7 (--frames 7)"),
     "spurious": (["synth", "--spurious", "1.5"], "--spurious: 1.5"),
     "no run": (["evaluate", "NOWHERE", "--truth", "DATA"], "nowhere: no such folder"),
     "no maps": (["evaluate", "DATA", "--truth", "DATA"], r"neither map_* folders"),
