@@ -13,7 +13,7 @@ from densify.config import DensifyConfig
 from densify.gating import LEFT_OUT
 from densify.joining import MergeConfig, Merged, joined_name, merge
 from densify.judging.doubts import DoubtsCalibrated, calibrated_together
-from densify.judging.verdict import Verdict, doubted, proposal, worst
+from densify.judging.verdict import Verdict, doubted, headline, proposal, worst
 from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify_or_empty
 from densify.predictions import SeenKeyframe
@@ -79,8 +79,13 @@ class Densified:
     @property
     def verdict(self) -> Verdict | None:
         """On all of them: the worst; None where nothing was judged."""
-        found = worst([r.judgement.verdict for r in self.results if r.judgement is not None])
+        found = worst([r.verdict for r in self.results if r.verdict is not None])
         return None if found is None else doubted(found, self.doubts)
+
+    @property
+    def headline(self) -> str:
+        """The verdict in words; empty where nothing was judged."""
+        return headline({r.dense.submap.id: r.verdict for r in self.results if r.verdict is not None}, self.doubts)
 
     @cached_property
     def uncertainty(self) -> DoubtsCalibrated | None:
@@ -114,7 +119,7 @@ class Densified:
         """Sentences for the page: what the surfaces were made of (`of`), under which light, and what is weak."""
         light = frames.first().light
         under = f"gamma {light.gamma:.3g}, mu {light.mu:.3g} ({light.source})"
-        notes = [f"Verdict: {self.verdict}."] if self.verdict is not None else []
+        notes = [f"Verdict: {self.headline}."] if self.headline else []
         notes += [f"{of}; depth by {self.model}; light of the frames: {under}."]
         notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
         notes.append(f"Uncertainty: {self.of_uncertainty}.")
@@ -144,7 +149,7 @@ class Densified:
                 f"begin with the first: {'; '.join(reasons[:3]) or 'nothing was fused'}",
             )
         if self.verdict is not None:
-            run.log(f"verdict: {self.verdict}")
+            run.log(f"verdict: {self.headline}")
             run.record["verdict"] = plain(self.verdict)
         self._write_uncertainty(run)
         note_recipe(run, self.config)
@@ -163,7 +168,7 @@ class Densified:
                     "seen_share": result.seen_share,
                     "unsure_share": dense.unsure_share,
                     "coverage": result.coverage and result.coverage.scaled(mm_per_unit or 1.0).record(),
-                    "verdict": judgement and plain(judgement.verdict),
+                    "verdict": result.verdict and plain(result.verdict),
                     "judge": judgement and judgement.record(),
                     "doubted": result.doubts,
                     "seconds": result.seconds,
@@ -180,7 +185,7 @@ class Densified:
             if judgement is not None:
                 text += "; " + judgement.summary
                 if len(self.results) > 1:
-                    run.log(f"{name}: {judgement.verdict}")
+                    run.log(f"{name}: {result.verdict}")
             if result.coverage is not None:
                 text += f"; {result.coverage.well_share:.0%} of the wall seen well, {len(result.coverage.holes)} holes"
             if dense.unsure_share is not None:

@@ -86,7 +86,7 @@ def map_and_frames(
     the images say that they are not its."""
     if mapped.map is None:
         frames = open_frames(source, run, None, sfm).without_truth()
-        return made_sparse(run, frames, sfm), frames
+        return made_sparse(run, frames, sfm, files=source.image_files), frames
     check_camera_asked(source)
     sparse_map, frames = open_with_map(source, mapped.map, mapped)
     frames = frames.without_truth()

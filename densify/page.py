@@ -193,7 +193,8 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
         "How far the distances of single keyframes are from distances that they were not fitted to, as a share, in the "
         "median. This is agreement, not error: map and images may be wrong together with the surface, by one factor or "
         "a slow drift of it above all. The map: points of blocks of wall, hidden from every keyframe in turn; points "
-        "drawn one by one lie beside points that were used, and flatter. The images: distances by parallax between "
+        "drawn one by one lie beside points that were used, and flatter. As delivered: with as much of its bend as a "
+        "keyframe kept, which is what log and evaluate have. The images: distances by parallax between "
         "keyframes. A constant distance gets the same help, one scale or a bend: what the prediction does not win by, "
         "the map has earned. The surface itself uses every point."
     )
@@ -204,23 +205,27 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
             continue
         for what, c in (("map, hidden blocks", j.blocks), ("map, drawn points", j.drawn), ("images", j.images)):
             if c.count:
-                rows.append([name, what, c.count, c.one_scale, c.bent, c.constant_one_scale, c.constant_bent])
-    headers = ["", "agreement with", "distances", "one scale", "bent", "constant, one scale", "constant, bent"]
+                delivered = j.hidden.median if c is j.blocks and j.hidden is not None else None
+                ways = [c.one_scale, c.bent, delivered, c.constant_one_scale, c.constant_bent]
+                rows.append([name, what, c.count, *ways])
+    headers = ["", "agreement with", "distances", "one scale", "bent", "as delivered", "constant, one scale"]
+    headers += ["constant, bent"]
     page.table(headers, rows)
     for result in results:
         j = result.judgement
         if j is None:
             continue
-        text = f"Map {result.dense.submap.id}: {j.verdict}."
+        said = [f"{result.verdict}."] if len(results) > 1 else []  # a single one is said above
         if j.surface is not None:
-            met = "" if j.surface.median_met is None else f" {100 * j.surface.median_met:.1f} % in the median;"
-            text += f" The surface against the images:{met} {100 * j.surface.miss:.0f} % of their rays miss it"
-            text += "." if spoke(j.surface) else f" ({j.surface.points} pixels, too few to judge by)."
+            missed = f"{100 * j.surface.miss:.0f} % of the images' rays miss the surface"
+            few = "" if spoke(j.surface) else f" ({j.surface.points} pixels, too few to judge by)"
+            said.append(f"{missed}{few}.")
         braked = [a for a in result.dense.alignments if a.unbent_because]
         if braked:
-            text += f" {j.undone} keyframes keep one scale, {j.lessened} a part of their bend; "
-            text += f"{braked[0].keyframe}: {braked[0].unbent_because}."
-        page.text(text)
+            kept = f"{j.undone} keyframes keep one scale, {j.lessened} a part of their bend"
+            said.append(f"{kept}; {braked[0].keyframe}: {braked[0].unbent_because}.")
+        if said:
+            page.text(f"Map {result.dense.submap.id}: {' '.join(said)}")
 
 
 def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:

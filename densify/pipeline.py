@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from densify.coverage import Coverage, coverage, seen_share
 from densify.dense_map import DenseMap
 from densify.fusers import fuser_for
 from densify.judgement import Judge
-from densify.judging.verdict import Judgement
+from densify.judging.verdict import Judgement, Verdict
 from densify.predictions import Clock, Predictions, Predictor, SeenKeyframe
 from lightdepth.brief import Brief
 from lightdepth.datasets import FrameSequence
@@ -47,6 +47,14 @@ class SubmapResult(Brief):
     """what of the wall was seen; None under the paper's recipe, whose fusion cannot tell"""
     doubts: dict[str, str] = field(default_factory=dict)
     """keyframes whose depth is doubted for want of light's contrast, with the reason; left out or not"""
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Whether the surface can be trusted, and what of the wall it shows well; None where nothing was judged."""
+        if self.judgement is None:
+            return None
+        seen_well = None if self.coverage is None else self.coverage.well_share
+        return replace(self.judgement.verdict, seen_well=seen_well)
 
 
 OnKeyframe = Callable[[Submap, AlignedKeyframe, SeenKeyframe], None]

@@ -179,7 +179,9 @@ def test_evaluate_writes_the_tables_into_the_run_and_again_without_asking(run, d
     shown = capsys.readouterr().out
     for name in ("metrics.json", "metrics.md", "metrics.csv", "metrics.tex", "map_000_error.ply", "run.json"):
         assert (run / "evaluation" / name).is_file()
-    assert (run / "evaluation" / "metrics.md").read_text() in shown
+    lines = [line for line in shown.splitlines() if line.startswith("| ")]
+    assert [line.split("|")[1].strip() for line in lines[2:5]] == ["map 0", "map 1", "all"] and len(lines) < 15
+    assert shown.splitlines()[-1] == f"every figure: {run}/evaluation/metrics.md"
     rows = json.loads((run / "evaluation" / "metrics.json").read_text())["maps"]
     assert all(row["sparse"]["rms_mm"] > 5 * row["dense"]["rms_mm"] for row in rows)
     assert lightdepth("evaluate", run, "--truth", data) == 0
@@ -208,9 +210,13 @@ def test_evaluate_without_truth_shows_the_agreement_with_the_map_beside_a_consta
     record = json.loads((tmp_path / "e" / "metrics.json").read_text())
     maps = json.loads((run / "run.json").read_text())["maps"]
     assert [w["withheld"]["median"] for w in record["withheld"]] == [m["judge"]["hidden"]["median"] for m in maps]
+    log = (run / "log.txt").read_text()  # says the same figures
+    for each in record["withheld"]:
+        found, constant = (each[name]["median"] for name in ("withheld", "withheld_constant"))
+        assert f"depth is {found:.1%} (a constant distance {constant:.1%}) from hidden blocks of the map" in log
     text = (tmp_path / "e" / "metrics.md").read_text()
     assert "no truth needed" in text and text.count("constant distance") == len(maps)
-    assert text in capsys.readouterr().out
+    assert text.rstrip() in capsys.readouterr().out
 
 
 def test_evaluate_without_anything_to_compare_with_is_refused(data, run, tmp_path, capsys):
@@ -304,7 +310,7 @@ BAD_INPUT = {
     "mask": (["predict", "DATA", "--mask", "NOWHERE", "--checkpoint", "decline"], "nowhere: no such mask"),
     "frames": (["synth", "--frames", "0"], "--frames: 0; expected a number from 1"),
     "no pixels": (["synth", "--size", "[0, 0]"], "--size: [0, 0]; expected each number"),
-    "too few frames": (["synth", "--frames", "2", "--size", "[24, 20]"], "render more frames"),
+    "too few frames": (["synth", "--frames", "2", "--size", "[24, 20]"], "at least 7 (--frames 7)"),
     "spurious": (["synth", "--spurious", "1.5"], "--spurious: 1.5"),
     "no run": (["evaluate", "NOWHERE", "--truth", "DATA"], "nowhere: no such folder"),
     "no maps": (["evaluate", "DATA", "--truth", "DATA"], r"neither map_* folders"),

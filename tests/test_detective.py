@@ -16,7 +16,7 @@ from colons import colon, sequence, slam
 from raising import refused
 
 from densify.inputs import MapSource, map_and_frames
-from lightdepth.camera import Brown, Pinhole
+from lightdepth.camera import Brown, CameraModel, Pinhole
 from lightdepth.datasets import FrameSequence, SequenceSource, write_folder
 from lightdepth.datasets.counting import Counting
 from lightdepth.detective import PairingConfig, Verdict, check_pairing, investigate
@@ -261,3 +261,31 @@ def test_a_keyframe_is_counted_by_rate_then_offset():
     keyframe = Keyframe("000010.png", CAMERA, np.eye(4), np.zeros((0, 2)), np.zeros(0, int))
     assert Counting().number(keyframe) == 10 and Counting(1.2, -1).number(keyframe) == 11
     assert shown(film()).of_keyframe(keyframe, Counting(offset=2)).number == 12
+
+
+def by_camera(camera: CameraModel) -> FrameSequence:
+    """The film, whose own camera is another one."""
+    return sequence([replace(f, camera=camera) for f in film()])
+
+
+def test_a_camera_beside_the_frames_that_puts_the_map_s_points_elsewhere_is_doubted_and_the_pixels_said():
+    other = Pinhole(128, 104, 60.0, 60.0, 64.0, 52.0)
+    verdict = investigate(honest_map(), by_camera(other))
+    (submap,) = honest_map().submaps
+    moved = [
+        np.linalg.norm(other.project(points)[0] - CAMERA.project(points)[0], axis=1)
+        for points in (k.in_camera(submap.observed_points(k)[1]) for k in submap.keyframes)
+    ]
+    assert verdict.judgement == "doubtful" and "make the map anew" in verdict.cure
+    assert f"{np.median(np.concatenate(moved)):.1f} px" in verdict.sentence
+    assert is_honest(investigate(honest_map(), by_camera(Pinhole(128, 104, 70.5, 70.5, 64.0, 52.0))))
+
+
+def test_the_pinhole_of_undistorted_keypoints_is_no_other_camera_than_its_lens():
+    assert is_honest(investigate(honest_map(), by_camera(LENS)))
+
+
+def test_a_given_camera_is_doubted_by_a_map_without_keypoints_too():
+    verdict = investigate(ghost(SEED), shown(film()), Pinhole(128, 104, 45.0, 45.0, 64.0, 52.0))
+    assert verdict.judgement == "wrong" and "--camera" in verdict.cure
+    assert is_honest(investigate(ghost(SEED), shown(film()), CAMERA))

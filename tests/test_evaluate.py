@@ -19,11 +19,20 @@ from verbs import by_options
 
 from densify.commands.evaluate import evaluate as evaluate_verb
 from densify.config import DensifyConfig
+from densify.evaluation.in_short import in_short
 from densify.evaluation.judge import judge_maps
 from densify.evaluation.judge_depth import judge_depth
 from densify.evaluation.judged_map import JudgedMap, dense_models, read_run
 from densify.evaluation.suite import alone
-from densify.evaluation.tables import Table, depth_table, long_rows, surface_table, trajectory_table, write_evaluations
+from densify.evaluation.tables import (
+    Table,
+    cell_text,
+    depth_table,
+    long_rows,
+    surface_table,
+    trajectory_table,
+    write_evaluations,
+)
 from densify.evaluation.truth import read_truth
 from densify.pipeline import densify
 from lightdepth.datasets import write_folder
@@ -376,3 +385,20 @@ def test_options_that_mean_nothing_are_refused(run, data, tmp_path):
     with pytest.raises(InputError) as caught:
         evaluate(tmp_path / "dense", None, tmp_path / "out")
     assert "run.json: maps: withheld.p90 missing" in str(caught.value)
+
+
+def shown(*args) -> list[list[str]]:
+    lines = [line.strip("| ").split(" | ") for line in in_short(*args).splitlines() if line.startswith("| ")]
+    return [line for line in lines if not line[0].startswith(("---", "# KF"))]
+
+
+def test_what_is_shown_is_a_line_for_each_map_and_all_or_for_each_sequence(run, predictions):
+    found = judge_maps(dense_models(read_run(run)), read_truth(sequence(FRAMES)))
+    rows, judged = shown({"a": found}), found.judged
+    assert [row[0] for row in rows] == ["map 0", "map 1", "all"] and {row[3] for row in rows} == {"Dense"}
+    assert rows[2][4] == cell_text(judged.pooled["dense"].rms_mm)
+    assert rows[1][2] == cell_text(judged.maps[1].aligned.rms_ate_mm)
+    rows = shown({"a": found, "b": found})
+    assert [row[0] for row in rows] == ["a", "b"] and rows[0][1:] == rows[1][1:]
+    one = judge_depth(predictions, sequence(list(FRAMES)))
+    assert {row[1] for row in shown({"a": one, "b": one})[1:]} == {"mean over sequences", "mean over frames"}

@@ -15,7 +15,7 @@ from densify.judgement import Judge
 from densify.judging.brake import Kept, Tried, kept, kept_of_finer
 from densify.judging.columns import Columns
 from densify.judging.config import JudgeConfig
-from densify.judging.verdict import Judgement, Verdict, proposal, worst
+from densify.judging.verdict import Judgement, Verdict, headline, proposal, worst
 from densify.judging.withheld import Withheld
 from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify_submap
@@ -276,6 +276,28 @@ def test_a_verdict_says_nothing_twice():
         for off in (0.08, 0.2):
             said = known(surface=surface, hidden=Withheld(500, off, 0.3, 0.0, off)).verdict.sentence
             assert said.count("hidden blocks") == said.count("the images") == 1, said
+
+
+def test_the_headline_says_what_of_the_wall_was_seen_well_and_of_several_maps_which_it_is_on():
+    near, far = (replace(known(surface=Withheld(500, m, 0.3, 0.0, m)).verdict, seen_well=m * 10) for m in (0.02, 0.08))
+    assert headline({0: near}).startswith("green, 20% of the wall seen well: the images put the wall 2.0%")
+    assert headline({0: near, 3: far}).startswith("amber (map 3, the worst of 2), 80% of its wall seen well: ")
+    assert headline({0: near}, ["doubt"]).startswith("amber, 20% of the wall seen well: doubt; ") and headline({}) == ""
+    assert str(known().verdict).startswith("green: ")
+
+
+@pytest.mark.parametrize("number", [0.02, 0.1, 0.2])
+@pytest.mark.parametrize("silent", [True, False])
+@pytest.mark.parametrize("aligned", [10, 7, 3])
+def test_no_part_of_a_verdict_s_sentence_is_said_twice(number, silent, aligned):
+    """Nor a figure, nor that keyframes were aligned where all were."""
+    told = Withheld(500, number, 0.3, 0.5, number)
+    made = known(surface=None, hidden=told) if silent else known(surface=told)
+    against = replace(made, images=Columns(500, 0.031, 0.08, 0.083, 0.083), aligned=aligned)
+    parts = against.verdict.sentence.split("; ")
+    assert len(set(parts)) == len(parts) and sum(f"{number:.1%}" in part for part in parts) == 1, parts
+    assert sum("images have" in part for part in parts) == silent
+    assert sum("keyframes" in part for part in parts) == (aligned < 10)
 
 
 def test_a_better_map_is_proposed_where_the_images_speak_against_it_and_only_there():

@@ -1,5 +1,6 @@
 """Structure from motion on the inside of a textured box, whose walls are known exactly."""
 
+import csv
 import logging
 import subprocess
 import sys
@@ -7,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from colons import sequence
 from raising import refused
 
 from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole, Scaramuzza
+from lightdepth.datasets import write_folder
+from lightdepth.datasets.reading import image_files
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
 from lightdepth.sfm.config import SfmConfig
@@ -83,7 +87,8 @@ def aligned(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, np.
 def mapped(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sfm") / "sparse"
     stages = []
-    result = sparse_map_from_frames(film(PINHOLE, 8), folder, progress=lambda *p: stages.append(p))
+    files = {10 + k: f"{10 + k:08d}.jpg" for k in range(7)}
+    result = sparse_map_from_frames(film(PINHOLE, 8), folder, progress=lambda *p: stages.append(p), files=files)
     return result, folder, stages
 
 
@@ -110,6 +115,21 @@ def test_the_written_model_is_the_returned_one(mapped):
         assert all(k.camera == PINHOLE for k in b.keyframes)
     cameras = [line for line in (folder / "0" / "cameras.txt").read_text().splitlines() if not line.startswith("#")]
     assert len(cameras) == 1
+
+
+def test_beside_a_model_is_the_way_back_from_its_images_to_the_frames_files(mapped):
+    with (mapped[1] / "0" / "images.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header == ["image", "source"] and [row[0] for row in rows] == [f"{n:06d}.png" for n in range(10, 18)]
+    assert [row[1] for row in rows] == [*(f"{n:08d}.jpg" for n in range(10, 17)), film(PINHOLE, 8)[7].name]
+
+
+def test_files_of_frames_are_known_by_number_and_a_video_has_none(tmp_path):
+    write_folder(sequence(film(PINHOLE, 2)), tmp_path / "frames")
+    assert image_files(tmp_path / "frames") == {
+        k: f"{f.name}.png" for k, f in zip((10, 11), film(PINHOLE, 2), strict=True)
+    }
+    assert image_files(tmp_path / "video.mp4") == {}
 
 
 def test_progress_goes_through_the_stages_to_their_ends(mapped):

@@ -12,7 +12,7 @@ from raising import refused
 
 from lightdepth.sparse_map import Submap
 from lightdepth.tube import lens, render_sequence
-from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
+from lightdepth.tube.slam import SimulatedSlam, SlamConfig, check_enough_frames, least_frames, simulate_slam
 
 TRACKED = SlamConfig()
 
@@ -104,8 +104,17 @@ def test_keyframes_are_ten_to_twenty_frames_apart_unless_it_is_said():
     (submap,) = simulate_slam(frames, replace(TRACKED, maps=1), 0).map.submaps
     gaps = np.diff([k.number for k in submap.keyframes])
     assert gaps.min() >= 10 and gaps.max() <= 20 and len(set(gaps)) > 1
-    with refused(where="2 maps", cure="--slam.keyframe-every"):
-        simulate_slam(frames[:25], TRACKED, 0)
+
+
+@pytest.mark.parametrize("config", [TRACKED, SlamConfig("independent"), replace(TRACKED, maps=3, keyframe_every=7)])
+def test_too_few_frames_are_refused_with_the_least_number_that_does(config):
+    (few,) = colon(0, 1, 1.0).frames
+    for seed in range(5):
+        least = least_frames(config, seed)
+        with refused(where=f"{least - 1} frames", found=f"{config.maps} submaps", cure=f"--frames {least})"):
+            simulate_slam([few] * (least - 1), config, seed)
+        check_enough_frames(least, config, seed)
+    assert least_frames(SlamConfig("independent"), 0) == 7
 
 
 def test_a_wall_without_corners_has_no_map():

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
+from densify.evaluation.in_short import in_short
 from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import dense_models, read_run
 from densify.evaluation.tables import write_evaluations
@@ -15,6 +16,7 @@ from densify.page import densify_page
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import open_sequence
+from lightdepth.errors import InputError
 from lightdepth.maps import read_map
 from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
 from lightdepth.reporting.progress import Progress
@@ -22,7 +24,7 @@ from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import Lens, render_sequence
 from lightdepth.tube import lens as tube_lens
 from lightdepth.tube.export import write_synthetic
-from lightdepth.tube.slam import SlamConfig, simulate_slam
+from lightdepth.tube.slam import SlamConfig, least_frames, simulate_slam
 
 
 def demo(
@@ -57,22 +59,28 @@ def demo(
         lens=lens,
         spurious=spurious,
     )
+    config = SlamConfig("independent", spurious=spurious)
+    least = least_frames(config, seed)
+    if frames < least:
+        found = f"{frames}, too few for {config.maps} submaps of two keyframes each"
+        raise InputError("--frames", found, f"expected at least {least}")
     model = predicting.load(details=False)
     with run_folder(output, "demo", arguments, overwrite) as run:
         with Progress("Rendering", frames) as bar:
             sequence = render_sequence(
                 seed, frames, tube_lens(lens, *size), 0.7 * frames, progress=lambda *_: bar.advance()
             )
-        slam = simulate_slam(sequence.frames, SlamConfig("independent", spurious=spurious), seed)
+        slam = simulate_slam(sequence.frames, config, seed)
         write_synthetic(sequence.frames, slam, run.folder / "data")
         data = open_sequence(run.folder / "data")
         sparse_map = read_map(run.folder / "data" / "slam")
         work = Densified.make(data, sparse_map, model, DensifyConfig())
         work.write(run, ("ply",), None)
         evaluation = judge_maps(dense_models(read_run(run.folder)), read_truth(data))
-        run.log(write_evaluations({"demo": evaluation}, run.folder))
+        write_evaluations({"demo": evaluation}, run.folder)
+        run.log(in_short({"demo": evaluation}))
         run.record["evaluation"] = [found.record() for found in evaluation.judged.maps]
-        notes = [f"Verdict: {work.verdict}."] if work.verdict is not None else []
+        notes = [f"Verdict: {work.headline}."] if work.headline else []
         notes += [
             f"A synthetic colon (seed {seed}), {frames} frames, a simulated SLAM export of {len(sparse_map.submaps)} "
             f"submaps with {spurious:.0%} wrong points; depth by {work.model}. Truth is exact, so errors are errors.",

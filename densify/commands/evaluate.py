@@ -6,6 +6,7 @@ from pathlib import Path
 
 from densify.config import DensifyConfig
 from densify.evaluation.depth_files import DepthReading
+from densify.evaluation.in_short import in_short
 from densify.evaluation.judge import judge_gap
 from densify.evaluation.judged_map import read_run
 from densify.evaluation.records import Sources
@@ -45,6 +46,7 @@ def evaluate(
             and use it if depth by it fits hidden blocks of wall better; switched off, a usual light is assumed.
         overwrite: Replace metrics made before (evaluation/ in a run is replaced without asking).
     """
+    folder = output or run / "evaluation"
     arguments = recorded(
         source,
         predicting,
@@ -52,7 +54,7 @@ def evaluate(
         reading,
         config,
         run=run,
-        output=output,
+        output=folder,
         join=join,
         suite=suite,
         trajectory=trajectory,
@@ -61,8 +63,10 @@ def evaluate(
     asked = read_asked(run, source, judging, join, suite, trajectory, output is None, reading)
     first = dense_first(predicting, source, config, fit_light)
     gap = None if join is None else judge_gap(read_run(run), join)
-    with run_folder(output or run / "evaluation", "evaluate", arguments, overwrite or output is None) as out:
+    with run_folder(folder, "evaluate", arguments, overwrite or output is None) as out:
         out.hash_inputs(truth=source.truth)
         answer = judge_asked(asked, first, out)
         sources = Sources(run, source.truth, gap, "" if first is None else str(first))
-        out.log(write_evaluations(answer.found, out.folder, answer.withheld, sources, asked.suite))
+        write_evaluations(answer.found, out.folder, answer.withheld, sources, asked.suite)
+        out.log(in_short(answer.found, answer.withheld, sources))
+        out.log(f"every figure: {folder}/metrics.md")

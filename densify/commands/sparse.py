@@ -93,7 +93,9 @@ def sparse(
             map_and_frames(run, source, MapSource.read_as(repair, reading, repair_map=True), sfm)
             return
         frames = open_frames(source, run, None, sfm).without_truth()
-        made_sparse(run, frames, sfm, None if poses is None else _poses(poses, frames, source, reading))
+        known = None if poses is None else _poses(poses, frames, source, reading)
+        made_sparse(run, frames, sfm, known, source.image_files)
+        run.log(f"{output}/sparse")
 
 
 def _poses(given: str, frames: FrameSequence, source: SequenceSource, reading: MapReading) -> dict[int, np.ndarray]:

@@ -241,8 +241,9 @@ def withheld_table(withheld: Sequence[WithheldOfMap]) -> Table:
             if found is not None:
                 rows.append([where, name, found.points, found.median, found.p90, found.miss])
     title = (
-        "Agreement with the sparse map: |distance - point| / point along the ray, at points that were hidden from the "
-        "alignment; no truth needed, and no error either."
+        "Agreement with the sparse map: |distance - point| / point along the ray, of each keyframe's depth as it was "
+        "delivered to the surface, at points in blocks of wall that were hidden from the alignment (the median is in "
+        "densify's log); no truth needed, and no error either."
     )
     return Table(title, ["Map", "Depth", "Points", "Median", "90th percentile", "Share that misses"], rows)
 
@@ -281,7 +282,7 @@ def write_evaluations(
     sources: Sources | None = None,
     suite: Suite | None = None,
 ) -> str:
-    """Everything, into the folder; the text of the tables."""
+    """Everything, into the folder; the text of the tables, as metrics.md has it."""
     record = metrics_record(found, withheld, sources)
     (folder / "metrics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     results = {name: e.judged for name, e in found.items()}
@@ -347,12 +348,15 @@ def _notes(results: Mapping[str, DepthJudged | MapsJudged], gap: MapGap | None) 
             notes.append(f"Alignment: {judged.alignment}. CLiMB: {judged.trajectory.climb_rule}.\n")
             if judged.trajectory.localised_share is None:
                 notes.append(f"Share of frames localised {judged.trajectory.localised_of}.\n")
-    if gap is not None:
-        notes.append(
-            f"Maps {gap.first} and {gap.second}: gap median {gap.gap.median:.2%}, 90th percentile {gap.gap.p90:.2%} of "
-            f"the distance to the camera, over {gap.gap.rays} rays.\n"
-        )
-    return notes
+    return notes if gap is None else [*notes, gap_note(gap)]
+
+
+def gap_note(gap: MapGap) -> str:
+    """The gap between two submaps in a sentence."""
+    return (
+        f"Maps {gap.first} and {gap.second}: gap median {gap.gap.median:.2%}, 90th percentile {gap.gap.p90:.2%} of "
+        f"the distance to the camera, over {gap.gap.rays} rays.\n"
+    )
 
 
 def long_rows(results: Mapping[str, DepthJudged | MapsJudged]) -> list[list[Cell]]:

@@ -14,6 +14,7 @@ principal point the fused points are half a pixel beside the surface.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,9 +47,15 @@ def read_array(path: Path) -> np.ndarray:
     return planes[0] if len(planes) == 1 else planes.transpose(1, 2, 0)
 
 
-def write_colmap(exported: Exportable, folder: Path, frames: FrameSequence | None, points: int) -> list[str]:
+def write_colmap(
+    exported: Exportable,
+    folder: Path,
+    frames: FrameSequence | None,
+    points: int,
+    on_keyframe: Callable[[], None] = lambda: None,
+) -> list[str]:
     """The model and the workspace; `points` is how many of the surface's vertices stand in it at most. Returns what is
-    to be said of the lenses."""
+    to be said of the lenses. `on_keyframe` is called as each keyframe is done."""
     said: dict[str, None] = {}
     cameras: dict[CameraModel, CameraModel] = {}
     for camera in dict.fromkeys(k.camera for k in exported.submap.keyframes):
@@ -74,6 +81,7 @@ def write_colmap(exported: Exportable, folder: Path, frames: FrameSequence | Non
             write_image(folder / "images" / keyframe.name, frame.image)
             picture = seen_by(frame.image, own.camera, keyframe.camera)
             write_image(folder / "dense" / "images" / keyframe.name, picture)
+        on_keyframe()
     names = [k.name for k in undistorted]
     (stereo / "fusion.cfg").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
     (stereo / "patch-match.cfg").write_text("".join(f"{name}\n__auto__, 20\n" for name in names), encoding="utf-8")

@@ -8,6 +8,7 @@ files by `depth_unit_scale_factor`, which is 1e-3 unless it is told otherwise. P
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +35,15 @@ def intrinsics(camera: CameraModel) -> dict[str, object]:
     return {"camera_model": model, "w": camera.width, "h": camera.height, **numbers}
 
 
-def write_nerfstudio(exported: Exportable, folder: Path, frames: FrameSequence | None, points: int) -> list[str]:
+def write_nerfstudio(
+    exported: Exportable,
+    folder: Path,
+    frames: FrameSequence | None,
+    points: int,
+    on_keyframe: Callable[[], None] = lambda: None,
+) -> list[str]:
     """transforms.json and what it names; `points` is how many of the surface's vertices are in points.ply at most.
-    Returns what is to be said of the lenses."""
+    Returns what is to be said of the lenses. `on_keyframe` is called as each keyframe is done."""
     said: dict[str, None] = {}
     cameras: dict[CameraModel, CameraModel] = {}
     for camera in dict.fromkeys(k.camera for k in exported.submap.keyframes):
@@ -57,6 +64,7 @@ def write_nerfstudio(exported: Exportable, folder: Path, frames: FrameSequence |
                 entry["mask_path"] = f"masks/{name}.png"
         entry["transform_matrix"] = (np.linalg.inv(keyframe.cam_from_map) @ _OPENGL).tolist()
         entries.append(entry if len(cameras) == 1 else {**intrinsics(camera), **entry})
+        on_keyframe()
     shared = intrinsics(next(iter(cameras.values()))) if len(cameras) == 1 else {}
     rows = exported.thinned(points)
     write_cloud(folder / "points.ply", exported.dense.vertices[rows], exported.colors[rows])

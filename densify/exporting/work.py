@@ -18,6 +18,7 @@ from lightdepth.calibration import read_camera
 from lightdepth.datasets import FORMATS, FrameSequence, open_sequence
 from lightdepth.errors import InputError
 from lightdepth.ranges import ANY, at_least, checked
+from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run
 
 MAP_KINDS = Literal["colmap", "nerfstudio", "ply", "glb", "obj", "tum", "climb"]
@@ -53,28 +54,47 @@ def export_maps(run: Run, source: Path, to: str, options: MapExport) -> None:
         seconds = run_record(source).get("seconds")
         work = float(seconds) if isinstance(seconds, (int, float)) else 0.0
         write_climb(single, run.folder, times, options.frame_offset, options.points, (0.0, work))
-        run.log(f"{len(single)} maps, frames counted from {options.frame_offset}, in {single[0].unit}")
+        counted = f"frames counted from {options.frame_offset}, in {single[0].unit}"
+        run.log(f"3D_maps/, camera_trajectory/ and runtime.txt have {len(single)} maps, {counted}")
         return
-    for exported in maps:
-        folder = run.folder / exported.name
-        folder.mkdir()
-        said: list[str] = []
-        if to == "colmap":
-            said = write_colmap(exported, folder, frames, options.points)
-            if not exported.tracked:
-                run.warn(f"{exported.name}: the map's points have no tracks: --map MAP, which the run was made of")
-        elif to == "nerfstudio":
-            said = write_nerfstudio(exported, folder, frames, options.points)
-        elif to == "ply":
-            write_surfaces(exported, folder)
-        elif to == "tum":
-            write_trajectory(exported, folder / "trajectory.tum", times)
-        else:
-            write_mesh(exported, folder / f"mesh.{to}")
-        for words in said:
-            run.warn(f"{exported.name}: {words}")
-        _keep_origin(run, source, exported.name)
-        run.log(f"{exported.name}: {len(exported.submap.keyframes)} keyframes, {len(exported.dense.vertices)} vertices")
+    with Progress("Exporting keyframes", sum(len(m.submap.keyframes) for m in maps)) as bar:
+        for exported in maps:
+            _write_map(run, to, exported, frames, times, options.points, bar)
+            _keep_origin(run, source, exported.name)
+
+
+def _write_map(
+    run: Run,
+    to: str,
+    exported: Exportable,
+    frames: FrameSequence | None,
+    times: Mapping[int, float],
+    points: int,
+    bar: Progress,
+) -> None:
+    """One map into the folder of its name, and a line of what lies there."""
+    folder, keyframes = run.folder / exported.name, len(exported.submap.keyframes)
+    folder.mkdir()
+    said: list[str] = []
+    if to == "colmap":
+        said = write_colmap(exported, folder, frames, points, bar.advance)
+        if not exported.tracked:
+            run.warn(f"{exported.name}: the map's points have no tracks: --map MAP, which the run was made of")
+    elif to == "nerfstudio":
+        said = write_nerfstudio(exported, folder, frames, points, bar.advance)
+    elif to == "ply":
+        write_surfaces(exported, folder)
+    elif to == "tum":
+        write_trajectory(exported, folder / "trajectory.tum", times)
+    else:
+        write_mesh(exported, folder / f"mesh.{to}")
+    if to not in ("colmap", "nerfstudio"):
+        bar.advance(keyframes)
+    for words in said:
+        run.warn(f"{exported.name}: {words}")
+    made = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir()))
+    vertices = "" if to == "tum" else f"{len(exported.dense.vertices)} vertices, "
+    run.log(f"{exported.name}/ has {made}: {keyframes} keyframes, {vertices}in {exported.unit}")
 
 
 def _keep_origin(run: Run, source: Path, name: str) -> None:

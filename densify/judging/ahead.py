@@ -9,7 +9,7 @@ last keyframe of a submap is done, distances by parallax between its images judg
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,6 +49,8 @@ class Ahead:
     """number of those that were aligned"""
     surface: Withheld | None = None
     """the finished surface against distances by parallax; None where the images are silent or were not asked"""
+    seen_well: float | None = None
+    """share of the finished surface's wall that was seen well; None where there is no surface"""
 
     @classmethod
     def of(cls, errors: Sequence[np.ndarray], keyframes: int, aligned: int, surface: Withheld | None = None) -> Ahead:
@@ -75,7 +77,8 @@ class Ahead:
 
     @property
     def verdict(self) -> Verdict:
-        return ahead_verdict(self.columns, self.by_points, self.surface, self.keyframes, self.aligned)
+        found = ahead_verdict(self.columns, self.by_points, self.surface, self.keyframes, self.aligned)
+        return replace(found, seen_well=self.seen_well)
 
     def record(self) -> dict[str, object]:
         """For run.json."""

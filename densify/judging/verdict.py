@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -74,15 +74,13 @@ class Judgement:
 
     @property
     def summary(self) -> str:
-        """Both agreements in a few words, with the constant distance's under the same help."""
-        told = [f"agreement with the map {self._beside(self.blocks)}"]
+        """How far the depth of single keyframes, before it is fused, is from hidden blocks of the map, as `evaluate`
+        has it, and from the images; with the constant distance's under the same help."""
+        mapped = [float("inf") if w is None else w.median for w in (self.hidden, self.hidden_constant)]
+        told = f"single keyframes' depth is {_beside(*mapped)} from hidden blocks of the map"
         if self.images.count:
-            told.append(f"with the images {self._beside(self.images)}")
-        return ", ".join(told)
-
-    @staticmethod
-    def _beside(columns: Columns) -> str:
-        return f"{_share(columns.best)} (a constant distance {_share(columns.constant)})"
+            told += f", {_beside(self.images.best, self.images.constant)} from the images"
+        return told
 
     def record(self) -> dict[str, object]:
         """For run.json."""
@@ -113,9 +111,20 @@ class Verdict:
     say"""
     judge: Asked = ""
     """whose word the number is; empty where nobody could be asked"""
+    seen_well: float | None = None
+    """share of the wall that was seen well (densify.coverage), to which a colour says nothing; None where nothing told
+    it"""
 
     def __str__(self) -> str:
-        return f"{self.colour}: {self.sentence}"
+        return self.headline()
+
+    def headline(self, whose: str = "") -> str:
+        """The colour, what of the wall was seen well, and the reasons; `whose` names the map where there are
+        several."""
+        head = f"{self.colour} ({whose})" if whose else self.colour
+        if self.seen_well is not None:
+            head += f", {self.seen_well:.0%} of {'its' if whose else 'the'} wall seen well"
+        return f"{head}: {self.sentence}"
 
 
 def proposal(j: Judgement) -> str:
@@ -140,6 +149,16 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict | None:
     return max(verdicts, key=lambda v: (order.index(v.colour), v.number), default=None)
 
 
+def headline(verdicts: Mapping[int, Verdict], doubts: Sequence[str] = ()) -> str:
+    """The verdict on a run in words, of several maps (by id) with the one that it is on; empty where there is none."""
+    found = worst(list(verdicts.values()))
+    if found is None:
+        return ""
+    name = next(name for name, verdict in verdicts.items() if verdict is found)
+    whose = f"map {name}, the worst of {len(verdicts)}" if len(verdicts) > 1 else ""
+    return doubted(found, doubts).headline(whose)
+
+
 def spoke(surface: Withheld | None) -> bool:
     """Whether the images say enough of a surface to judge it by."""
     return surface is not None and surface.points >= _LEAST
@@ -148,8 +167,9 @@ def spoke(surface: Withheld | None) -> bool:
 def _by_images(surface: Withheld) -> tuple[str, list[str], list[str]]:
     """What the images say of a surface, and which of it makes it red, and amber."""
     number = float("inf") if surface.median_met is None else surface.median_met
-    said = f"the images' parallax puts the wall {_share(number)} from the surface in the median"
-    said += f" ({surface.points} pixels)"
+    said = (
+        f"the images put the wall {_share(number)} of its distance from the surface (median of {surface.points} pixels)"
+    )
     red, amber = ([said], []) if number > RED else ([], [said] if number > GREEN else [])
     if surface.miss > _MISSES:
         amber.append(f"{surface.miss:.0%} of what they see is not on the surface")
@@ -171,26 +191,21 @@ def _verdict(j: Judgement) -> Verdict:
     if j.surface is not None and spoke(j.surface):
         said, red, amber = _by_images(j.surface)
     else:
-        silent = "the images have too little texture or parallax to judge by"
-        said = silent if j.asked else "the images were not asked (--judge.parallax.on false)"
-        hidden = f"hidden blocks of the map's wall are {_share(number)} off"
-        red, amber = ([], [f"{said}; {hidden}"]) if number <= RED else ([f"{hidden}, and {said}"], [])
+        said = "the images have too little texture or parallax to judge by"
+        said = said if j.asked else "the images were not asked (--judge.parallax.on false)"
+        said += f"; hidden blocks of the map's wall are {_share(number)} off"
+        red, amber = ([], [said]) if number <= RED else ([said], [])
     amber += _few(j.keyframes, j.aligned)
+    remarks = _some(j.keyframes, j.aligned)
     light = j.images if j.images.count >= _LEAST else j.blocks
-    remarks = []
     if j.images.count >= _LEAST and j.images.bent > _AGAINST * j.images.one_scale:
         remarks.append(
-            f"the map's points bend the depth against the images ({_share(j.images.bent)} off, one scale "
-            f"{_share(j.images.one_scale)}): they may err together; {j.undone} keyframes keep one scale, "
-            f"{j.lessened} a part of their bend"
+            f"the map's points may err together: they bend the depth against the images ({_share(j.images.bent)} off, "
+            f"at one scale {_share(j.images.one_scale)})"
         )
     remarks += _no_merit(light)
-    if red:
-        return Verdict("red", "; ".join(red + amber + remarks), number, j.judge)
-    if amber:
-        return Verdict("amber", "; ".join(amber + remarks), number, j.judge)
-    remarks.append(f"{j.aligned} of {j.keyframes} keyframes aligned")
-    return Verdict("green", "; ".join([said, *remarks]), number, j.judge)
+    colour: Colour = "red" if red else "amber" if amber else "green"
+    return Verdict(colour, "; ".join(dict.fromkeys([said, *red, *amber, *remarks])), number, j.judge)
 
 
 def ahead_verdict(
@@ -230,12 +245,21 @@ def _few(keyframes: int, aligned: int) -> list[str]:
     return [f"only {aligned} of {keyframes} keyframes could be aligned"] if 2 * aligned < keyframes else []
 
 
+def _some(keyframes: int, aligned: int) -> list[str]:
+    """A remark where some keyframes have no part in the surface, but not most."""
+    return [f"{aligned} of {keyframes} keyframes aligned"] if keyframes <= 2 * aligned < 2 * keyframes else []
+
+
 def _no_merit(columns: Columns) -> list[str]:
     """A remark where a constant distance does as well."""
     if columns.best < _NO_MERIT * columns.constant:
         return []
     against = f"({_share(columns.constant)} against {_share(columns.best)})"
     return [f"the light adds nothing here: a constant distance does as well {against}"]
+
+
+def _beside(value: float, constant: float) -> str:
+    return f"{_share(value)} (a constant distance {_share(constant)})"
 
 
 def _share(value: float) -> str:

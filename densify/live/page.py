@@ -7,16 +7,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from densify.judging.ahead import Ahead, running
-from densify.judging.verdict import Verdict
 from densify.live.play import Played
 from lightdepth.reporting.figures import chart, chart_png
 from lightdepth.reporting.report import Report
 
 
-def live_page(verdict: Verdict | None, judged: Mapping[int, Ahead], played: Sequence[Played], timings: bytes) -> Report:
-    """The whole page; `judged` by map, empty where nothing was, `timings` the picture of them (PNG)."""
+def live_page(verdict: str, judged: Mapping[int, Ahead], played: Sequence[Played], timings: bytes) -> Report:
+    """The whole page; `verdict` in words and `judged` by map, empty where nothing was, `timings` the picture of them
+    (PNG)."""
     page = Report("Live surfaces")
-    if verdict is not None:
+    if verdict:
         page.text(f"Verdict: {verdict}.")
         _agreement(page, judged, played)
     page.heading("Time")
@@ -43,7 +43,7 @@ def _agreement(page: Report, judged: Mapping[int, Ahead], played: Sequence[Playe
     headers = ["", "new points", "as fused", "one scale", "bent", "constant, one scale", "constant, bent"]
     headers += ["pixels of the images", "surface from them"]
     page.table(headers, rows)
-    for number, found in judged.items():
+    for number, found in judged.items() if len(judged) > 1 else ():  # a single one is said above
         page.text(f"Map {number}: {found.verdict}.")
     page.wide_figures(
         [(_running_picture(judged, played), "The same while the surfaces grew: medians up to each keyframe")]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from densify.coverage import Coverage, CoverageConfig
 from densify.coverage import coverage as coverage_of
 from densify.judging.ahead import Ahead
-from densify.judging.verdict import doubted, worst
+from densify.judging.verdict import doubted, headline, worst
 from densify.judging.withheld import Withheld
 from densify.live.page import live_page
 from densify.live.play import Finished, Played, time_spent, timings_picture, write_timings
@@ -44,7 +44,9 @@ class _MapRecord:
 
     def judged(self, played: Sequence[Played]) -> Ahead:
         """What new points of the map and the images say of it."""
-        return Ahead.of([p.ahead for p in played if p.map == self.map], self.keyframes, self.aligned, self.by_images)
+        errors = [p.ahead for p in played if p.map == self.map]
+        found = Ahead.of(errors, self.keyframes, self.aligned, self.by_images)
+        return replace(found, seen_well=None if self.coverage is None else self.coverage.well_share)
 
 
 class PlayedRun:
@@ -94,10 +96,11 @@ class PlayedRun:
         spent = time_spent(played, budget_ms / 1000)
         unit = "mm" if self._mm_per_unit else "map units"
         judged = {record.map: record.judged(played) for record in self._records if self._judged}
-        verdict = worst([found.verdict for found in judged.values()])
+        verdicts = {number: found.verdict for number, found in judged.items()}
+        verdict, said = worst(list(verdicts.values())), headline(verdicts, self._doubts)
         if verdict is not None:
             verdict = doubted(verdict, self._doubts)
-            run.log(f"verdict: {verdict}")
+            run.log(f"verdict: {said}")
         maps = [
             {**record.record(), "verdict": found and plain(found.verdict), "ahead": found and found.record()}
             for record in self._records
@@ -108,7 +111,7 @@ class PlayedRun:
         run.record["doubted"] = doubts = {p.keyframe: p.doubt for p in played if p.doubt}
         if doubts:
             run.log(sentence(doubts, len(played)))
-        live_page(verdict, judged, played, picture).write(run.folder / "report.html")
+        live_page(said, judged, played, picture).write(run.folder / "report.html")
         timings = spent.timings
         assert timings is not None, "a surface has keyframes that were read"
         run.log(

@@ -45,7 +45,7 @@ class _LightFile(BaseModel):
     direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
     gain: float = 1.0
     reflectance: float = 0.0
-    source: Literal["measured", "published", "given", "assumed"] = "given"
+    source: Literal["measured", "fitted", "published", "given", "assumed"] = "given"
 
 
 def camera_from_fields(data: Any, where: str) -> CameraModel:

@@ -21,7 +21,7 @@ from lightdepth.tube.export import write_synthetic
 from lightdepth.tube.map_errors import MapErrors, moved_ids, with_errors
 from lightdepth.tube.scene import TubeConfig, realistic
 from lightdepth.tube.sequence import TubeSequence
-from lightdepth.tube.slam import SlamConfig, simulate_slam
+from lightdepth.tube.slam import SlamConfig, check_enough_frames, simulate_slam
 
 _SIZE = (320, 256)
 
@@ -139,6 +139,7 @@ def synth(
     if slam.spurious is not None and not 0 <= slam.spurious < 1:
         raise InputError("--spurious", f"{slam.spurious}", "expected a share of at least 0 and below 1")
     colon = colon.in_layout(layout)
+    check_enough_frames(colon.frames, slam, colon.seed)  # before minutes are spent on rendering them
     with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", colon.frames) as bar:
         sequence = colon.rendered(scene, breathing, lambda *_: bar.advance())
         made = sequence.frames

@@ -19,7 +19,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.below import folders_in
 from lightdepth.files.images import image_size
 from lightdepth.files.reading import reading
-from lightdepth.frame import check_image_size
+from lightdepth.frame import check_image_size, frame_number
 from lightdepth.option_names import option
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.which_frame import Stamps
@@ -81,6 +81,15 @@ def stamps_of(path: str | Path, format: str | None = None) -> Stamps:
             return np.zeros(0, int), None  # what is wrong is said when the frames are opened
 
     return Stamps(load, str(images))
+
+
+def image_files(path: Path, format: str | None = None) -> dict[int, str]:
+    """Names of the frames' files by frame number; none of a video, whose frames have no files."""
+    if not path.is_dir() or (format in (None, "video") and video_at(path) is not None) or _is_cluster(path, format):
+        return {}
+    data_set = _BY_NAME.get(format) if format is not None else _looks_like(path)
+    images = (data_set or folder.FORMAT).images(path)
+    return {frame_number(p.name): p.name for p in list_images(images)} if images.is_dir() else {}
 
 
 def _open(

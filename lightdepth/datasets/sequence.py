@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from lightdepth.datasets.counting import BY_NUMBER, Counting
+from lightdepth.datasets.glare import rim_of_glare
 from lightdepth.errors import InputError
 from lightdepth.files.headers import Header, header_of, what_is_there
 from lightdepth.files.images import ARRAY_SUFFIXES, PICTURE_SUFFIXES, image_size, read_image, read_raw
@@ -304,7 +305,8 @@ def spread_images(images: Sequence[Path], white: float | None = None, count: int
 
 
 def border_mask(images: Sequence[np.ndarray]) -> np.ndarray:
-    """(H, W) bool: `border_region` shrunk by 0.4 % of the height, away from the halo of compression. Read-only."""
+    """(H, W) bool: `border_region` shrunk by 0.4 % of the height, away from the halo of compression, and without a rim
+    of glare. Read-only."""
     region = border_region(images)
     if region.all():
         region.flags.writeable = False
@@ -312,6 +314,7 @@ def border_mask(images: Sequence[np.ndarray]) -> np.ndarray:
     shrink = 2 * max(1, round(0.004 * region.shape[0])) + 1
     padded = cv2.copyMakeBorder(region.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
     mask = cv2.erode(padded, np.ones((shrink, shrink), np.uint8), borderValue=1)[1:-1, 1:-1].astype(bool)
+    mask &= ~rim_of_glare(images, region)
     mask.flags.writeable = False  # one for all frames of a sequence
     return mask
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.no_camera import NoCamera
-from lightdepth.datasets.reading import FormatName, open_sequence
+from lightdepth.datasets.reading import FormatName, image_files, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.ranges import Range, checked
@@ -63,6 +63,11 @@ class SequenceSource:
             return open_sequence(self.data, self.format, self.camera, self.light, self.mask, map_camera, self.bit_depth)
         except NoCamera as error:
             raise error.of_other_verb(self.data) from error
+
+    @property
+    def image_files(self) -> dict[int, str]:
+        """Names of the frames' files by frame number; none of a video."""
+        return image_files(self.data, self.format)
 
     @property
     def files(self) -> dict[str, Path | None]:

@@ -18,6 +18,7 @@ import numpy as np
 from lightdepth.camera import CameraModel
 from lightdepth.datasets.counting import BY_NUMBER, Counting
 from lightdepth.datasets.sequence import FrameSequence
+from lightdepth.detective.cameras import other_camera
 from lightdepth.detective.colours import Colours, colour_sightings
 from lightdepth.detective.evidence import LEAST_POINTS, Fit, by_keyframe, compared, compared_apart, told_from_chance
 from lightdepth.detective.geometry import geometry_of
@@ -58,12 +59,13 @@ def investigate(sparse_map: SparseMap, frames: FrameSequence, given: CameraModel
 
 def _findings(submap: Submap, pictures: Pictures, given: CameraModel | None, places: int) -> Findings:
     geometry = geometry_of(submap, given)
+    beside = other_camera(submap, _camera_of(pictures) if given is None else given, given is not None)
     seen = _with_sightings(submap)
     witnesses = None if seen is None else _witnesses(seen, pictures, BY_NUMBER, places)
     colours = None if seen is None else _colours(seen, pictures, witnesses)
     if seen is None or witnesses is None:
         unseen = tuple(_other_maps(submap, pictures, places, None)) if submap.weak_visibility else ()
-        return Findings(submap.id, geometry, tried=unseen, colours=colours)
+        return Findings(submap.id, geometry, tried=unseen, colours=colours, other_camera=beside)
     at_hand = witnesses.votes(pictures, BY_NUMBER)
     # A map without keypoints has its points where its poses put them, not on corners.
     corners = None if submap.weak_visibility else witnesses.corners(pictures, BY_NUMBER)
@@ -111,6 +113,7 @@ def _findings(submap: Submap, pictures: Pictures, given: CameraModel | None, pla
         tuple(tried),
         tuple(controls),
         colours,
+        beside,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lightdepth.detective.cameras import OtherCamera
 from lightdepth.detective.colours import Colours
 from lightdepth.detective.evidence import CLEAR, LEAST_POINTS, Fit
 from lightdepth.detective.geometry import Geometry
@@ -38,11 +39,13 @@ class Findings:
     elsewhere: tuple[Fit, ...] = ()
     """frames far away, which the map cannot be of"""
     colours: Colours | None = None
+    other_camera: OtherCamera | None = None
+    """the frames' own camera, or the one that the user gave, beside the map's"""
 
 
 def judged(found: Findings) -> Verdict:
     """The verdict; images first, as they know most."""
-    judgement, sentence, cure = _with_colours(found, *_said(found))
+    judgement, sentence, cure = _with_camera(found, *_with_colours(found, *_said(found)))
     fits = (*(fit for _, fit in found.tried), *found.elsewhere)
     untold = _untold(found)
     if judgement == "agrees" and untold:
@@ -58,7 +61,27 @@ def judged(found: Findings) -> Verdict:
         untold,
         found.submap,
         found.colours,
+        found.other_camera,
     )
+
+
+def _with_camera(found: Findings, judgement: Judgement, sentence: str, cure: str) -> tuple[Judgement, str, str]:
+    """What a second camera adds to what else was said: keypoints judge one that was given, where there are any."""
+    other = found.other_camera
+    if other is None or not other.differs or judgement == "wrong" or (other.given and found.geometry is not None):
+        return judgement, sentence, cure
+    apart = f"{other.pixels:.1f} px (median) from where the map's does" if other.pixels < 1e6 else "out of its view"
+    if other.given:
+        said = f"the given camera puts the map's points {apart}"
+        if other.pixels > MAX_MEDIAN_PX:
+            return "wrong", said, f"leave --camera out, {_TRUST}"
+        return "doubtful", said, cure or "leave --camera out"
+    said = f"the frames' own camera puts the map's points {apart}; the map's is used"
+    own = (
+        "if the map's is right, put it in place of the frames' own; if theirs is, make the map anew with it "
+        "(lightdepth sparse)"
+    )
+    return "doubtful", f"{sentence}; {said}" if judgement == "doubtful" else said, cure or own
 
 
 def _with_colours(found: Findings, judgement: Judgement, sentence: str, cure: str) -> tuple[Judgement, str, str]:

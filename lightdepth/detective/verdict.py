@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from lightdepth.detective.cameras import OtherCamera
 from lightdepth.detective.colours import Colours
 from lightdepth.detective.evidence import Fit
 from lightdepth.detective.geometry import Geometry
@@ -37,6 +38,8 @@ class Verdict:
     """which submap it is about"""
     colours: Colours | None = None
     """what the points' colours say; None where they have none"""
+    other_camera: OtherCamera | None = None
+    """the frames' own camera, or a given one, beside the map's; None where there is none, or no observation"""
 
     def record(self) -> dict[str, object]:
         """As run.json holds it."""
@@ -47,6 +50,7 @@ class Verdict:
             "told_from_chance": self.from_chance,
             "geometry": None if self.geometry is None else self.geometry.record(),
             "could_not_tell": list(self.untold),
+            "other_camera_px": None if self.other_camera is None else self.other_camera.pixels,
             "colours": None if self.colours is None else self.colours.record(),
         }
         return {"judgement": self.judgement, "sentence": self.sentence, "figures": figures}

@@ -11,6 +11,7 @@ from lightdepth.exporting.depth import checked_step, depth_of, fitting_step, wri
 from lightdepth.files.exr import write_exr
 from lightdepth.models import NetworkModel
 from lightdepth.prediction import read_prediction
+from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run
 
 DEPTH_KINDS = Literal["png", "exr"]
@@ -41,14 +42,16 @@ def export_depth(run: Run, folder: Path, to: str, step: float | None) -> None:
         prediction = read_prediction(file)
         unit, largest = prediction.unit, max(largest, float(depth_of(prediction).max()))
     chosen = fitting_step(largest, unit) if step is None else checked_step(step, largest, unit)
-    for file in files:
-        depth = depth_of(read_prediction(file))
-        if to == "png":
-            write_png16(run.folder / f"{file.stem}.png", depth, chosen)
-        else:
-            write_exr(run.folder / f"{file.stem}.exr", depth)
+    with Progress("Exporting depth", len(files)) as bar:
+        for file in files:
+            depth = depth_of(read_prediction(file))
+            if to == "png":
+                write_png16(run.folder / f"{file.stem}.png", depth, chosen)
+            else:
+                write_exr(run.folder / f"{file.stem}.exr", depth)
+            bar.advance()
     run.record.update({"kind": "depth along the axis", "unit": unit, "step": chosen if to == "png" else None})
     scale = f" --depth-scale {chosen:g}" if unit == "mm" else ""
     scale = scale if to == "png" or unit != "mm" else " --depth-scale 1"
     codes = f"{f'; one code is {chosen:g}' if to == 'png' else ''} (evaluate --depth-kind depth{scale})"
-    run.log(f"{len(files)} files of depth along the axis, {unit}, 0 where unknown{codes}")
+    run.log(f"{len(files)} .{to} files of depth along the axis, {unit}, 0 where unknown{codes}")

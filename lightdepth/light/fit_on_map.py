@@ -201,7 +201,7 @@ def fit_on_map(
         "default": hidden_error(judging, judge, default, place),
         "fitted": hidden_error(judging, judge, hiding, place),
     }
-    fitted = PhotometricCalibration(gamma=gamma, mu=mu, source="measured")
+    fitted = PhotometricCalibration(gamma=gamma, mu=mu, source="fitted")
     return LightFit(
         fitted,
         uncertainty,
@@ -222,7 +222,7 @@ def _fitted_without(views: Sequence[LightView], hidden: Mapping[int, np.ndarray]
     if not seen:
         return PhotometricCalibration()
     gamma, mu, *_ = fit_samples(seen, draws=1)
-    return PhotometricCalibration(gamma=gamma, mu=mu, source="measured")
+    return PhotometricCalibration(gamma=gamma, mu=mu, source="fitted")
 
 
 def _check_lit(source: str, views: Sequence[LightView]) -> None:

@@ -15,15 +15,20 @@ from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.keeping import KeptDatabase
-from lightdepth.sfm.reconstruction import SfmMap, sparse_map_from_frames
+from lightdepth.sfm.reconstruction import SOURCES, SfmMap, sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
 from lightdepth.sparse_map import SparseMap, with_provenance
 
 
 def made_sparse(
-    run: Run, frames: Sequence[Frame], config: SfmConfig, poses: Mapping[int, np.ndarray] | None = None
+    run: Run,
+    frames: Sequence[Frame],
+    config: SfmConfig,
+    poses: Mapping[int, np.ndarray] | None = None,
+    files: Mapping[int, str] | None = None,
 ) -> SparseMap:
-    """A map by pycolmap, written to sparse/ in the run folder; `poses` (4, 4) by frame number, where they are known.
+    """A map by pycolmap, written to sparse/ in the run folder; `poses` (4, 4) by frame number, where they are known,
+    and `files`, the names of the frames' own.
     Of a camera that nobody calibrated, camera.json beside it says so."""
     stages: list[str] = []
 
@@ -33,11 +38,13 @@ def made_sparse(
             run.log(f"sparse map: {stage}")
 
     folder, database = run.folder / "sparse", KeptDatabase(run)
-    make = partial(sparse_map_from_frames, frames, folder, config, show, poses, database)
+    make = partial(sparse_map_from_frames, frames, folder, config, show, poses, database, files)
     found = kept(run, "sparse map", SfmMap, make, folder=folder)
     for submap in found.submaps:
         errors = number(float(np.median(submap.reprojection_errors())))
         run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
+    if files and any(files.get(k.number) != k.name for submap in found.submaps for k in submap.keyframes):
+        run.log(f"sparse map: its images are named by number; {SOURCES} in each folder has the names of the files")
     if found.poses is not None:
         run.log(f"known poses: {found.poses}")
         run.record["known_poses"] = plain(found.poses)

@@ -12,6 +12,7 @@ default, equal frames give equal maps.
 
 from __future__ import annotations
 
+import csv
 import logging
 import shutil
 import warnings
@@ -26,6 +27,7 @@ from lightdepth.camera import CameraModel, KannalaBrandt, Scaramuzza
 from lightdepth.camera_conversion import Conversion, convert_camera
 from lightdepth.errors import InputError
 from lightdepth.files.working import working_folder
+from lightdepth.foreign_text import for_table
 from lightdepth.frame import Frame, frame_number
 from lightdepth.maps import read_map
 from lightdepth.maps.colmap import holds_model
@@ -40,6 +42,7 @@ from lightdepth.sparse_map import Keyframe, SparseMap, Submap, check_rigid
 
 log = logging.getLogger(__name__)
 
+SOURCES = "images.csv"
 _JUDGED = 40  # pairs of frames by whose matches known poses are judged
 
 
@@ -63,14 +66,16 @@ def sparse_map_from_frames(
     progress: Progress | None = None,
     poses: Mapping[int, np.ndarray] | None = None,
     database: KeptDatabase | None = None,
+    files: Mapping[int, str] | None = None,
 ) -> SfmMap:
     """Frames -> submaps by number of frames, largest first, also written as COLMAP text models to out_folder/0, 1, ...
 
-    Keyframes are named by their frame's number, six digits, `.png`. With `poses`, map_from_cam (4, 4) by frame number,
-    nothing is moved: points are triangulated at these poses, in their unit, and there is one submap. Raises
-    InputError, leaving out_folder as it was, when the frames cannot be mapped, the folder already holds a map, or the
-    matches fit the poses only when these are read in another way, which is named. `database` keeps features and
-    matches.
+    Keyframes are named by their frame's number, six digits, `.png`; images.csv in each model's folder has the name of
+    the frame's own file beside, from `files` by number, or else the frame's name. With `poses`, map_from_cam (4, 4) by
+    frame number, nothing is moved: points are triangulated at these poses, in their unit, and there is one submap.
+    Raises InputError, leaving out_folder as it was, when the frames cannot be mapped, the folder already holds a map,
+    or the matches fit the poses only when these are read in another way, which is named. `database` keeps features
+    and matches.
     """
     config, progress, out_folder = config or SfmConfig(), progress or silent, Path(out_folder)
     check_free(out_folder)
@@ -110,6 +115,9 @@ def sparse_map_from_frames(
                 f"{config.min_model_size} of them by {config.min_points} points ({summary(why)})",
                 ADVICE,
             )
+        _write_sources(
+            models, submaps, {n: (files or {}).get(frame_number(n), own) for n, own in written.names.items()}
+        )
         _move_models(models, out_folder)
     if failed:
         log.warning("%d of %d frames are not in the map: %s", len(failed), len(frames), summary(list(failed.values())))
@@ -211,6 +219,15 @@ def check_free(out_folder: Path) -> None:
     taken = [p for p in out_folder.glob("*") if p.name.isdigit()] if out_folder.is_dir() else []
     if taken or (out_folder.is_dir() and holds_model(out_folder)):
         raise InputError(out_folder, "holds a map already", f"remove it, or use it as the map (--map {out_folder})")
+
+
+def _write_sources(models: Path, submaps: Sequence[Submap], sources: Mapping[str, str]) -> None:
+    """images.csv in the folder of each model: the way back from its images to the frames' own files, by name."""
+    for submap in submaps:
+        path = models / str(submap.id) / SOURCES
+        with path.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
+            rows = [[k.name, for_table(sources[k.name])] for k in submap.keyframes]
+            csv.writer(file).writerows([["image", "source"], *rows])
 
 
 def _move_models(models: Path, out_folder: Path) -> None:

@@ -9,6 +9,7 @@ Notation: a submap's frame is related to the world [mm] by X_map = scale · R X_
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
@@ -123,15 +124,10 @@ def simulate_slam(
     """
     if breathing is not None and config.kind == "independent":
         raise InputError("--breathing.amplitude", "an independent SLAM", "expected --slam.kind tracked")
+    check_enough_frames(len(frames), config, seed)
     settings = _Settings.of(config)
     rng = np.random.default_rng([seed, 1])
-    keyframes = _keyframes(frames, settings.keyframe_every, rng)
-    if len(keyframes) < 2 * config.maps:
-        raise InputError(
-            f"{config.maps} maps",
-            f"{len(keyframes)} keyframes cannot be shared among them",
-            "render more frames, or make more of them keyframes (--slam.keyframe-every)",
-        )
+    keyframes = [frames[i] for i in _places(len(frames), settings.keyframe_every, rng)]
     submaps, sims, wrong = [], {}, {}
     for map_id, part in enumerate(_parts(len(keyframes), config.maps, config.shared_keyframes)):
         chosen = [keyframes[i] for i in part]
@@ -142,12 +138,35 @@ def simulate_slam(
     return SimulatedSlam(SparseMap(tuple(submaps), "simulated SLAM"), sims, wrong)
 
 
-def _keyframes(frames: Sequence[Frame], every: int | None, rng: np.random.Generator) -> list[Frame]:
+def least_frames(config: SlamConfig, seed: int) -> int:
+    """The number of frames from which on there are two keyframes for each submap."""
+    every, needed = _Settings.of(config).keyframe_every, 2 * config.maps
+
+    def enough(count: int) -> bool:
+        return len(_places(count, every, np.random.default_rng([seed, 1]))) >= needed
+
+    return bisect_left(range((needed - 1) * (every or _GAPS[1]) + 1), True, key=enough)  # the last one always is
+
+
+def check_enough_frames(count: int, config: SlamConfig, seed: int) -> None:
+    """Raises InputError where `count` frames are too few, and says how many do."""
+    least = least_frames(config, seed)
+    if count < least:
+        raise InputError(
+            f"{count} frames",
+            f"too few for {config.maps} submaps of two keyframes each",
+            f"expected at least {least} (--frames {least}), keyframes closer together (--slam.keyframe-every), "
+            "or fewer submaps (--slam.maps)",
+        )
+
+
+def _places(count: int, every: int | None, rng: np.random.Generator) -> list[int]:
+    """Which of `count` frames are keyframes."""
     if every is not None:
-        return list(frames)[::every]
+        return list(range(0, count, every))
     (own,) = rng.spawn(1)
-    places = np.cumsum([0, *own.integers(*_GAPS, len(frames) // _GAPS[0], endpoint=True)])
-    return [frames[i] for i in places if i < len(frames)]
+    places = np.cumsum([0, *own.integers(*_GAPS, count // _GAPS[0], endpoint=True)])
+    return [i for i in places.tolist() if i < count]
 
 
 def _parts(count: int, maps: int, shared: int) -> list[range]:

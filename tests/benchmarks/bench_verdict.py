@@ -12,7 +12,8 @@ stood, the trajectories brought together by a similarity, and e_1 that of the sa
 
 RMS is that of the rays that all meet, or the one that sees less would win. Drift of scale stands apart: no image can
 see it. What `densify` says of frames and map before it begins is there too: where it refuses, the verdict is what a
-user gets who says --trust-map, and a pairing that is wrong or doubtful is never green.
+user gets who says --trust-map, and a pairing that is wrong or doubtful is never green. What of the wall was
+seen well stands in the headline beside the colour, which says nothing of it.
 
 LIGHTDEPTH_VERDICT=docs/verdict.md writes the tables there; LIGHTDEPTH_SCENES takes other colons, in sixes, as "710
 711 712 713 714 715", to tune on.
