@@ -350,3 +350,13 @@ def test_the_tiny_network_is_exported_by_torch_export_and_saved(tmp_path):
     torch.export.save(torch.export.export(network, given), tmp_path / "a.pt2")
     exported = torch.export.load(tmp_path / "a.pt2").module()
     assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(exported(*given), network(*given), strict=True))
+
+
+@pytest.mark.parametrize("width", [1, 9, 16, 31, 110])
+@pytest.mark.parametrize("norm", ["batch", "group"])
+def test_the_tiny_network_has_any_width(width, norm):
+    with torch.device("meta"):
+        network = build_network(NetworkConfig(width=width, norm=norm))
+    groups = [m for m in network.modules() if isinstance(m, torch.nn.GroupNorm)]
+    assert all(m.num_channels // m.num_groups >= min(8, m.num_channels) for m in groups)
+    assert bool(groups) == (norm == "group")

@@ -13,8 +13,11 @@ WIDTHS = (1, 2, 3, 4, 6)
 
 
 def normalisation(kind: str, channels: int) -> nn.Module:
-    """ "group" (at least 8 channels a group, independent of the batch) or "batch"."""
-    return nn.BatchNorm2d(channels) if kind == "batch" else nn.GroupNorm(max(1, channels // 8), channels)
+    """ "group" (at least 8 channels a group, or all where there are fewer, independent of the batch) or "batch"."""
+    if kind == "batch":
+        return nn.BatchNorm2d(channels)
+    groups = next(n for n in range(max(1, channels // 8), 0, -1) if channels % n == 0)
+    return nn.GroupNorm(groups, channels)
 
 
 class _Residual(nn.Module):
