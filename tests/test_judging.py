@@ -184,6 +184,7 @@ def test_a_keyframe_keeps_what_the_images_speak_for_of_its_bend(share):
 def test_a_submap_keeps_of_a_finer_grid_what_the_images_speak_for(share):
     assert kept_of_finer(speaking_for(share, size=0.03)) == pytest.approx(share, abs=0.21)
     assert kept_of_finer(speaking_for(share, 30)) == 0  # too few
+    assert kept_of_finer(speaking_for(share, size=0.03) + 0.2) == 0  # more than detail is wrong
     assert kept_of_finer(speaking_for(share, size=1e-4, noise=0.3)) == 0  # too unsure
 
 
@@ -212,7 +213,16 @@ def test_depth_is_bent_in_finer_detail_where_the_images_speak_for_it(submap, fra
     assert fine == {(5, 9)} and five == {(5,)} and error < 0.85 * before
     silent = replace(COARSE, judge=JudgeConfig(parallax=ParallaxConfig(on=False)))
     assert bent(exact, silent)[0] == {(5,)}
-    assert bent(submap, COARSE)[0] == {(5,)}  # its points are few, and err
+
+
+def test_points_that_err_in_fine_detail_bend_nothing(submap, frames):
+    """Points that are nearer and farther in turn around the axis, where depth is right."""
+    first = submap.keyframes[0]
+    off = submap.points - np.mean([k.center for k in submap.keyframes], axis=0)
+    around = np.arctan2(*(off @ first.cam_from_map[:2, :3].T).T)
+    wrong = replace(submap, points=submap.points + off * np.expm1(0.1 * np.sin(9 * around))[:, None])
+    bends = [a.bend for a in judged(wrong, frames)[1].dense.alignments if a.bend is not None]
+    assert bends and all(bend.config.grids == (5,) for bend in bends)
 
 
 def test_a_keyframe_with_few_distances_keeps_about_what_its_submap_keeps():

@@ -11,7 +11,8 @@ seen s is expected to be 1, give or take .5. A keyframe's own share is expected 
 Where s is below .3 the bend is undone, as what is left of it is wrong as likely as right; from .85 on all of it stays.
 
 What a finer grid of bumps adds to the bends of a submap is held against the same distances, all keyframes together:
-where a map's points are right it is right, where neighbours err together it follows their errors.
+where a map's points are right it is right, where neighbours err together it follows their errors. Where the
+images are more than 7 % off without it in the median, as on a map that drifts, none of it is kept.
 
 Where the images are silent, or leave s as unsure as it was, blocks of wall that were hidden from the bend decide
 between all of it and none. It must then be better by some, and no larger than its prior lets expect, since blocks
@@ -30,6 +31,7 @@ from lightdepth.robust import mad_sigma, robust_weights
 _NEIGHBOURS = 4.0
 _USUAL, _SPREAD, _APART = 1.0, 0.5, 0.1
 _NONE_BELOW, _ALL_FROM = 0.3, 0.85
+_NOT_DETAIL = 0.07
 _CUT = 0.4
 _BORROWED = 100.0
 _LEAST = 40
@@ -58,9 +60,9 @@ class Kept:
 
 def kept_of_finer(by_images: np.ndarray) -> float:
     """The share that a submap keeps of what a finer grid adds to its bends, by errors (n, 2) in log distance by the
-    images without it and with it; 0 where they cannot tell."""
+    images without it and with it; 0 where they cannot tell, or where more than detail is wrong."""
     errors = by_images[np.isfinite(by_images).all(1)]
-    if len(errors) < _LEAST:
+    if len(errors) < _LEAST or np.median(np.abs(errors[:, 0])) > _NOT_DETAIL:
         return 0.0
     own = _slope(errors, _USUAL)
     return _rounded(own.value) if own.variance < _SPREAD**2 else 0.0
