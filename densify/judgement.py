@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from densify.agreement import unbent
-from densify.aligned import AlignedKeyframe
+from densify.aligned import AlignedKeyframe, bent_finer
 from densify.alignment import bent
 from densify.bending import Bend
 from densify.config import DensifyConfig
@@ -59,13 +59,14 @@ class Judge:
         """What the images tell of each keyframe's distances, by name; nothing before `braked`."""
         return self._told
 
-    def can_tell(self) -> bool:
-        """Whether the images speak, by which a finer grid is judged."""
-        return self._config.judge.on and bool(self._look())
-
-    def refined(self, keyframes: Sequence[AlignedKeyframe], finer: Mapping[str, Bend]) -> list[AlignedKeyframe]:
+    def refined(self, keyframes: Sequence[AlignedKeyframe], shared: np.ndarray) -> list[AlignedKeyframe]:
         """The same keyframes, with as much of what a finer grid adds to their bends as the images speak for. Blocks of
-        wall are hidden from alignments without it."""
+        wall are hidden from alignments without it. `shared` (n, n) counts the points that two keyframes share."""
+        bending = self._config.bending
+        bends = self._config.agreement.on and bending.on and bending.finer > 0
+        if not (bends and self._config.judge.on and self._look()):
+            return list(keyframes)
+        finer = bent_finer(keyframes, shared, self._config)
         errors = [np.zeros((0, 2))]
         for k in keyframes:
             if k.keyframe.name in finer and k.bend is not None:

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from densify.aligned import (
     AlignedKeyframe,
     align_alone,
     align_together,
-    bent_finer,
     uncontradicted_keyframes,
     undoubted,
     unread,
@@ -120,9 +117,8 @@ def densify_submap(
         keyframes = undoubted(keyframes, doubts, config.gate)
         with clock("agree"):
             keyframes = align_together(keyframes, shared, config)
-        keyframes = _refined(keyframes, shared, config, judge, clock)
         with clock("judge"):
-            keyframes = judge.braked(keyframes)
+            keyframes = judge.braked(judge.refined(keyframes, shared))
         with clock("agree"):
             keyframes = uncontradicted_keyframes(keyframes, shared, config.contradiction)
     for i, each in enumerate(keyframes):
@@ -140,17 +136,3 @@ def densify_submap(
     with clock("judge"):
         judgement, share = judge.judgement(dense, keyframes), seen_share(dense, frames)
     return SubmapResult(dense, judgement, share, dict(clock), unread(keyframes), covered, doubts)
-
-
-def _refined(
-    keyframes: list[AlignedKeyframe], shared: np.ndarray, config: DensifyConfig, judge: Judge, clock: Clock
-) -> list[AlignedKeyframe]:
-    """The same keyframes, bent in finer detail where the images speak for it."""
-    with clock("judge"):
-        asked = config.agreement.on and config.bending.on and config.bending.finer > 0 and judge.can_tell()
-    if not asked:
-        return keyframes
-    with clock("agree"):
-        finer = bent_finer(keyframes, shared, config)
-    with clock("judge"):
-        return judge.refined(keyframes, finer)

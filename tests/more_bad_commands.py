@@ -3,7 +3,7 @@
 from bad_commands import DATA, DECLINE, HIDDEN, OUT, Command
 
 SMALL = "--scene.shape.step 1.2 --scene.shape.length 90 --scene.texture.resolution 0.4"
-SYNTH = f"synth {OUT} --frames 4 --size [24,20] {SMALL}"
+SYNTH = f"synth {OUT} --frames 4 --slam.keyframe-every 1 --size [24,20] {SMALL}"
 DENSIFY = f"densify {DATA} --map HERE/colmap {DECLINE} {OUT}"
 LIVE = f"live {DATA} --map HERE/colmap {DECLINE} {OUT}"
 PREDICT = f"predict {DATA} {DECLINE} {OUT}"

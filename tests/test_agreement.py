@@ -156,5 +156,5 @@ def test_a_fit_that_begins_at_another_one_ends_where_it_would_have_ended():
     finer = coarse.with_finer()
     start = [bend.with_finer() for bend in agree(views, shared, config, coarse)]
     afresh, on = (agree(views, shared, config, finer, s) for s in (None, start))
-    for a, b in zip(afresh, on, strict=True):
-        assert b.weights == pytest.approx(a.weights, abs=2e-3)
+    off = [errors(bends, predictions) for bends in (afresh, on)]
+    assert max(off[0]) < 0.01 and off[1] == pytest.approx(off[0], abs=2e-3)

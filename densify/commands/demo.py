@@ -60,12 +60,11 @@ def demo(
         spurious=spurious,
     )
     config = SlamConfig("independent", spurious=spurious)
-    least = least_frames(config, seed)
-    if frames < least:
-        found = f"{frames}, too few for {config.maps} submaps of two keyframes each"
-        raise InputError("--frames", found, f"expected at least {least}")
     model = predicting.load(details=False)
     with run_folder(output, "demo", arguments, overwrite) as run:
+        if frames < (least := least_frames(config, seed)):
+            found = f"{frames}, too few for {config.maps} submaps of two keyframes each"
+            raise InputError("--frames", found, f"expected at least {least}")
         with Progress("Rendering", frames) as bar:
             sequence = render_sequence(
                 seed, frames, tube_lens(lens, *size), 0.7 * frames, progress=lambda *_: bar.advance()

@@ -139,8 +139,8 @@ def synth(
     if slam.spurious is not None and not 0 <= slam.spurious < 1:
         raise InputError("--spurious", f"{slam.spurious}", "expected a share of at least 0 and below 1")
     colon = colon.in_layout(layout)
-    check_enough_frames(colon.frames, slam, colon.seed)  # before minutes are spent on rendering them
     with run_folder(output, "synth", arguments, overwrite) as run, Progress("Rendering", colon.frames) as bar:
+        check_enough_frames(colon.frames, slam, colon.seed)  # before minutes are spent on rendering them
         sequence = colon.rendered(scene, breathing, lambda *_: bar.advance())
         made = sequence.frames
         if layout == "endomapper":  # which counts frames from 1
