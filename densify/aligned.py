@@ -86,7 +86,8 @@ def bent_finer(keyframes: Sequence[AlignedKeyframe], shared: np.ndarray, config:
     rows = [i for i, each in enumerate(keyframes) if each.view is not None and each.bend is not None and each.alone]
     views = [view for i in rows if (view := keyframes[i].view) is not None]
     start = [bend.with_finer() for i in rows if (bend := keyframes[i].bend) is not None]
-    finer, agreement = config.bending.with_finer(), replace(config.agreement, rounds=_FINER_ROUNDS)
+    finer = config.bending.with_finer()
+    agreement = replace(config.agreement, rounds=min(_FINER_ROUNDS, config.agreement.rounds))
     bends = agree(views, shared[np.ix_(rows, rows)], agreement, finer, start) if rows else []
     return {keyframes[i].keyframe.name: bend for i, bend in zip(rows, bends, strict=True)}
 

@@ -194,8 +194,9 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
         "median. This is agreement, not error: map and images may be wrong together with the surface, by one factor or "
         "a slow drift of it above all. The map: points of blocks of wall, hidden from every keyframe in turn; points "
         "drawn one by one lie beside points that were used, and flatter. As delivered: with as much of its bend as a "
-        "keyframe kept, which is what log and evaluate have. The images: distances by parallax between "
-        "keyframes. A constant distance gets the same help, one scale or a bend: what the prediction does not win by, "
+        "keyframe kept, but for its finer grid, which is what log and evaluate have. The images: distances by "
+        "parallax between keyframes. A constant distance gets the same help, one scale or a bend: what the prediction "
+        "does not win by, "
         "the map has earned. The surface itself uses every point."
     )
     rows: list[list[Any]] = []

@@ -21,8 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from densify.exporting.exported import Exportable
-from densify.exporting.images import frame_of, known_camera, pinhole_of, seen_by, write_image
-from lightdepth.camera import CameraModel
+from densify.exporting.images import frame_of, known_cameras, pinhole_of, seen_by, write_image
 from lightdepth.datasets import FrameSequence
 from lightdepth.files.reading import reading
 from lightdepth.maps.colmap import write_text_model
@@ -56,11 +55,7 @@ def write_colmap(
 ) -> list[str]:
     """The model and the workspace; `points` is how many of the surface's vertices stand in it at most. Returns what is
     to be said of the lenses. `on_keyframe` is called as each keyframe is done."""
-    said: dict[str, None] = {}
-    cameras: dict[CameraModel, CameraModel] = {}
-    for camera in dict.fromkeys(k.camera for k in exported.submap.keyframes):
-        cameras[camera], words = known_camera(camera, CAMERAS, "OPENCV_FISHEYE")
-        said |= {words: None} if words else {}
+    cameras, said = known_cameras((k.camera for k in exported.submap.keyframes), CAMERAS, "OPENCV_FISHEYE")
     rows = exported.thinned(points)
     named = [replace(k, camera=cameras[k.camera], name=f"{stem(k)}.png") for k in exported.submap.keyframes]
     model = _with_surface(replace(exported.submap, keyframes=tuple(named)), exported, rows)
@@ -85,7 +80,7 @@ def write_colmap(
     names = [k.name for k in undistorted]
     (stereo / "fusion.cfg").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
     (stereo / "patch-match.cfg").write_text("".join(f"{name}\n__auto__, 20\n" for name in names), encoding="utf-8")
-    return list(said)
+    return said
 
 
 def stem(keyframe: Keyframe) -> str:

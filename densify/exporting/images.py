@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -36,6 +37,14 @@ def known_camera(camera: CameraModel, names: tuple[str, ...], instead: str) -> t
         f"(largest), over {found.seen_share:.1%} of the field"
     )
     return found.camera, said
+
+
+def known_cameras(
+    cameras: Iterable[CameraModel], names: tuple[str, ...], instead: str
+) -> tuple[dict[CameraModel, CameraModel], list[str]]:
+    """`known_camera` of each camera, by the camera itself, and what to say of them, each thing once."""
+    found = {camera: known_camera(camera, names, instead) for camera in dict.fromkeys(cameras)}
+    return {camera: known for camera, (known, _) in found.items()}, [*dict.fromkeys(w for _, w in found.values() if w)]
 
 
 def pinhole_of(camera: CameraModel) -> Pinhole:

@@ -16,7 +16,7 @@ import numpy as np
 from densify.dense_map import write_cloud
 from densify.exporting.colmap import stem
 from densify.exporting.exported import Exportable
-from densify.exporting.images import frame_of, known_camera, write_image
+from densify.exporting.images import frame_of, known_cameras, write_image
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 
@@ -44,11 +44,7 @@ def write_nerfstudio(
 ) -> list[str]:
     """transforms.json and what it names; `points` is how many of the surface's vertices are in points.ply at most.
     Returns what is to be said of the lenses. `on_keyframe` is called as each keyframe is done."""
-    said: dict[str, None] = {}
-    cameras: dict[CameraModel, CameraModel] = {}
-    for camera in dict.fromkeys(k.camera for k in exported.submap.keyframes):
-        cameras[camera], words = known_camera(camera, CAMERAS, "OPENCV_FISHEYE")
-        said |= {words: None} if words else {}
+    cameras, said = known_cameras((k.camera for k in exported.submap.keyframes), CAMERAS, "OPENCV_FISHEYE")
     (folder / "depths").mkdir()
     entries = []
     for keyframe in exported.submap.keyframes:
@@ -76,4 +72,4 @@ def write_nerfstudio(
         "frames": entries,
     }
     (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    return list(said)
+    return said

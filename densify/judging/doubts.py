@@ -24,7 +24,7 @@ class Doubts:
     predicted: tuple[HiddenErrors, ...]
     """errors at one scale for each keyframe"""
     delivered: tuple[HiddenErrors, ...]
-    """errors as delivered, by bend or scale"""
+    """errors as delivered, by bend (but for its finer grid) or scale"""
     against: str = ""
     """why the map is no judge of the uncertainty; empty where nothing speaks against it"""
 

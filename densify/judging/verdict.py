@@ -36,7 +36,7 @@ class Judgement:
     images: Columns
     """agreement with the images: distances by parallax, which nothing was fitted to"""
     hidden: Withheld | None = None
-    """the points of `blocks` by what each keyframe was delivered with, its bend or one scale"""
+    """the points of `blocks` by what a keyframe was delivered with, its bend but for the finer grid, or one scale"""
     hidden_constant: Withheld | None = None
     """the same points by a constant distance, bent"""
     surface: Withheld | None = None
