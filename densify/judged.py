@@ -268,7 +268,7 @@ def _maps(
         if first is not None:
             out.log(f"{name}: taken as it is, dense or without points; --checkpoint and its settings change nothing")
         frames = asked.source.sequence(folder).open()
-        reader = Reader(asked.config, stamps_of(folder, asked.source.format), frames[0].camera)
+        reader = Reader(asked.config, stamps_of(folder, asked.source.format), frames.first().camera)
         maps = read_models(judged, asked.trajectory, reader)
         check_truth(frames, asked.config.trust_truth)
         return frames, maps, withheld_errors(judged) if asked.suite else []

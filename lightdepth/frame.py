@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
@@ -58,6 +60,13 @@ class Frame(Brief):
         """(H, W) bool: inside the mask and inside the camera model's field."""
         rays_valid = self.camera.rays()[1]
         return rays_valid if self.mask is None else self.mask & rays_valid
+
+
+def readable(frames: Sequence[Frame], rows: Iterable[int]) -> Iterator[Frame]:
+    """The frames at these rows, but for those that cannot be read."""
+    for i in rows:
+        with suppress(InputError):
+            yield frames[i]
 
 
 def check_image_size(name: str, width: int, height: int, camera: CameraModel) -> None:

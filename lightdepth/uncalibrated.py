@@ -10,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.reading import size_of_frames
 from lightdepth.errors import InputError
 from lightdepth.files.working import working_folder
+from lightdepth.frame import readable
 from lightdepth.reporting.run import Run
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.self_calibration import SelfCalibration, across, self_calibrated
@@ -118,8 +120,9 @@ def _found(frames: FrameSequence, fov: float | None, run: Run, config: SfmConfig
     seen: list[SelfCalibration] = []
     failed: InputError | None = None
     tried: list[list[int]] = []
+    times = [*(frame.time for frame in islice(readable(frames, range(len(frames))), 2)), None, None][:2]
     for place in _PLACES:
-        rows = stretch(len(frames), [frames[i].time for i in (0, min(1, len(frames) - 1))], place)
+        rows = stretch(len(frames), times, place)
         if rows in tried:
             continue
         tried.append(rows)

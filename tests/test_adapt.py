@@ -24,7 +24,8 @@ from train.adapting.module import Adaptation, anchor_loss, let_learn, merge_low_
 from train.adapting.wall_judge import PointError, WallErrors
 from train.colons import TubeData
 from train.commands.adapt import adapt as adapt_verb
-from train.datamodule import FrameData, FrameDataModule, collate
+from train.datamodule import FrameData, FrameDataModule
+from train.loader import collate
 
 adapt = by_options(adapt_verb)
 

@@ -270,9 +270,12 @@ def test_the_verb_writes_a_light_that_can_be_read_and_a_report_with_nothing_left
     assert main([*argv, "--overwrite"]) == 0
 
 
+QUICK = ["--judge.on", "false", "--merge", "false"]
+
+
 @pytest.mark.parametrize("fit_light", [True, False])
 def test_densify_fits_the_light_that_nobody_gave_unless_told_not_to(data, tmp_path, fit_light, capsys):
-    argv = ["densify", str(data), "--map", str(data / "slam"), "--checkpoint", "decline", "--judge.on", "false"]
+    argv = ["densify", str(data), "--map", str(data / "slam"), "--checkpoint", "decline", *QUICK]
     assert main([*argv, "--fit-light", str(fit_light).lower(), "-o", str(tmp_path / "run")]) == 0
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     said = "light fitted on the map: gamma" in capsys.readouterr().out
@@ -289,7 +292,7 @@ def test_densify_fits_the_light_that_nobody_gave_unless_told_not_to(data, tmp_pa
 def test_densify_keeps_a_light_that_somebody_gave(data, tmp_path, given):
     folder = tmp_path / "seq"
     shutil.copytree(data, folder)
-    argv = ["densify", str(folder), "--map", str(folder / "slam"), "--checkpoint", "decline", "--judge.on", "false"]
+    argv = ["densify", str(folder), "--map", str(folder / "slam"), "--checkpoint", "decline", *QUICK]
     if given != "option":
         numbers = {} if given == "file with the default numbers" else {"gamma": 0.9, "mu": 1.0}
         (folder / "light.json").write_text(json.dumps({"gamma": 2.2, "mu": 2.767} | numbers))

@@ -29,6 +29,7 @@ from densify.bench.scenes import Scene
 from densify.commands import bench
 from densify.commands.sparse import sparse as sparse_verb
 from densify.fusion.volume import FusionConfig
+from densify.judging.config import JudgeConfig
 from lightdepth.checkpoint import save_model
 from lightdepth.cli import main
 from lightdepth.commands.import_frames import import_frames as import_frames_verb
@@ -287,7 +288,13 @@ def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(
 
     def verb(output: Path, **given) -> None:
         densify_verb(
-            tmp_path / "data", output, map=tmp_path / "data" / "slam", checkpoint="decline", fusion=coarse, **given
+            tmp_path / "data",
+            output,
+            map=tmp_path / "data" / "slam",
+            checkpoint="decline",
+            fusion=coarse,
+            judge=JudgeConfig(on=judging),
+            **given,
         )
 
     parts = stopped_everywhere(verb, tmp_path, stopping, every, anew=False)

@@ -12,8 +12,9 @@ from colons import sequence
 from raising import refused
 
 from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole, Scaramuzza
-from lightdepth.datasets import write_folder
+from lightdepth.datasets import FrameSequence, write_folder
 from lightdepth.datasets.reading import image_files
+from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.maps import read_map
 from lightdepth.sfm.config import SfmConfig
@@ -275,6 +276,18 @@ WRONG_POSES = {
         "with the poses inverted: … and the camera's y and z axes turned",
     ),
 }
+
+
+def test_where_too_few_frames_can_be_read_the_first_that_cannot_is_named(tmp_path):
+    def load(row: int) -> Frame:
+        if row in (1, 3):
+            raise InputError(f"{row}.png", "torn", "copy it again")
+        return film(PINHOLE, 1, first=row)[0]
+
+    frames = FrameSequence([f"{n:06d}" for n in range(4)], load, "the film")
+    with pytest.raises(InputError, match=r"^1.png: torn"):
+        sparse_map_from_frames(frames, tmp_path / "sparse", SfmConfig(max_features=400))
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module")

@@ -382,6 +382,29 @@ def test_one_black_frame_among_others_does_no_harm(tmp_path):
     assert all(torch.isfinite(value).all() for value in state(run).values())
 
 
+def test_a_frame_that_cannot_be_read_is_left_out_and_said_whichever_process_reads_it(tmp_path):
+    sequence = write_sequence(tmp_path / "seq", 12)
+    for torn in ("0003.png", "0011.png"):  # the second validates, with one that is whole
+        (sequence / "frames" / torn).write_bytes((sequence / "frames" / torn).read_bytes()[:100])
+    runs, said = [], []
+    for workers in ("0", "2"):
+        (tmp_path / workers).mkdir()
+        with pytest.warns(UserWarning, match="left out of training, with the next frame in its place: .*0003.png"):
+            options = ["--data.num_workers", workers, "--data.held_out", "0.2"]
+            runs.append(quick(tmp_path / workers, *options, sequence=sequence))
+        said.append(sorted(json.loads((runs[-1] / "run.json").read_text())["warnings"]))
+    assert said[0] == said[1] and len(said[0]) == 2 and "frames/0011.png: not a readable image" in said[0][1]
+    assert equal(*map(state, runs))
+
+
+def test_frames_of_which_none_can_be_read_end_the_run_whichever_process_reads_them(tmp_path):
+    sequence = write_sequence(tmp_path / "seq", 12)
+    (sequence / "frames" / "0011.png").write_bytes(b"torn")
+    for workers in ("0", "2"):
+        with pytest.raises(InputError, match=r"0011\.png: not a readable image"):
+            quick(tmp_path / workers, "--data.num_workers", workers, sequence=sequence)
+
+
 class Poison(Callback):
     """Makes the gradients of these steps NaN."""
 

@@ -15,8 +15,9 @@ from lightdepth.frame import flipped, to_batch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.photometry import irradiance
 from train.colons import TubeData
-from train.datamodule import FrameData, FrameDataModule, augmented, collate
+from train.datamodule import FrameData, FrameDataModule, augmented
 from train.frame_lists import read_frame_list
+from train.loader import collate
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -10,7 +10,7 @@ from lightdepth.calibration import write_camera, write_light
 from lightdepth.camera import Pinhole
 from lightdepth.frame import to_batch
 from lightdepth.photometry import PhotometricCalibration
-from train.datamodule import collate
+from train.loader import collate
 
 LIGHT = PhotometricCalibration(gain=100.0, position_mm=(1.0, 2.0, 0.5), direction=(0.1, -0.05, 1.0))
 CAMERA = Pinhole(40, 32, 22.0, 22.0, 18.0, 17.0)

@@ -6,8 +6,7 @@ resumed run sees what an uninterrupted one would have seen.
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Sequence
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, cast
@@ -24,16 +23,16 @@ from lightdepth.datasets.splits import check_apart, folders, read_split
 from lightdepth.errors import InputError
 from lightdepth.frame import FrameBatch, flipped, to_batch
 from lightdepth.losses import LossConfig
-from lightdepth.photometry import LightTerms, brightness, decode, encode
+from lightdepth.photometry import brightness, decode, encode
 from lightdepth.ranges import BELOW_ONE, BETWEEN, SEED, Range, at_least, checked, ends_of
 from lightdepth.reporting.progress import Progress
 from train.colons import SceneMaker, TubeData, colon_seeds, tube_scene, val_scene, with_reflectance
 from train.frame_lists import Listed, listed_rows, open_listed
+from train.loader import loader
 from train.order import Halves, Shuffled
 
 _NO_TUBE = TubeData()
 _WHITE = LossConfig().white
-_GRACE_S = 120.0
 _LOOKED_AT = 256  # frames whose colours are looked at, of all sequences together
 
 
@@ -132,6 +131,7 @@ class FrameDataModule(pl.LightningDataModule):
         self.sequences, self.val_sequences = config.sequences or [], config.val_sequences or []
         self.size, self.batch_size = (int(config.size[0]), int(config.size[1])), config.batch_size
         self.colours: dict[str, Colours] = {}
+        self._unread: dict[str, str] = {}  # what is said of frames that cannot be read, by file
         check_apart(self.sequences, self.val_sequences)
         self._train: ConcatDataset[FrameBatch] | None = None
         self._val: ConcatDataset[FrameBatch] | None = None
@@ -189,8 +189,10 @@ class FrameDataModule(pl.LightningDataModule):
 
     @property
     def doubts(self) -> list[str]:
-        """Sentences on training sequences that are not what the light's decline can teach from."""
-        return [f"{path}: {doubt}" for path, colours in self.colours.items() for doubt in colours.doubts]
+        """Sentences on training sequences that are not what the light's decline can teach from, and on frames that
+        could not be read until now."""
+        coloured = [f"{path}: {doubt}" for path, colours in self.colours.items() for doubt in colours.doubts]
+        return [*coloured, *self._unread.values()]
 
     def share(self, other: FrameDataModule) -> bool:
         """Takes the frames of `other`, which is set up, if they are what `setup` would read and render."""
@@ -287,35 +289,17 @@ class FrameDataModule(pl.LightningDataModule):
     def _loader(
         self, dataset: Dataset[FrameBatch], order: Shuffled | None = None, drop_last: bool = False
     ) -> DataLoader[FrameBatch]:
-        return DataLoader(
-            dataset,
-            sampler=order,
-            drop_last=drop_last,
-            batch_size=self.batch_size,
-            num_workers=self.config.num_workers,
-            persistent_workers=self.config.num_workers > 0,
-            collate_fn=collate,
-            worker_init_fn=_outliving_a_signal,
-        )
+        return loader(dataset, self.batch_size, self.config.num_workers, self._left_out, order, drop_last)
 
-
-def _outliving_a_signal(worker: int) -> None:
-    """A scheduler's SIGTERM is for all processes of a job; the run still needs frames to finish its step, and ends this
-    process then. Should it not, an alarm does."""
-    signal.signal(signal.SIGTERM, lambda number, frame: signal.setitimer(signal.ITIMER_REAL, _GRACE_S))
+    def _left_out(self, error: InputError) -> None:
+        if error.where not in self._unread:
+            self._unread[error.where] = f"left out of training, with the next frame in its place: {error}"
+            warnings.warn(self._unread[error.where], stacklevel=2)
 
 
 def held_out_count(frames: int, share: float) -> int:
     """How many frames at the end of a sequence are held out."""
     return max(1, int(share * frames))
-
-
-def collate(batches: Sequence[FrameBatch]) -> FrameBatch:
-    """One batch out of batches."""
-    columns = zip(*(batch[:3] + batch[4:] for batch in batches), strict=True)
-    image, mask, rays, true_distance, true_valid = (torch.cat(column) for column in columns)
-    light = LightTerms(*(torch.cat(column) for column in zip(*(batch.light for batch in batches), strict=True)))
-    return FrameBatch(image, mask, rays, light, true_distance, true_valid)
 
 
 def augmented(batch: FrameBatch, generator: torch.Generator) -> FrameBatch:

@@ -14,7 +14,7 @@ from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.reading import stamps_of
 from lightdepth.errors import InputError
 from lightdepth.files.tum import read_tum
-from lightdepth.frame import frame_number
+from lightdepth.frame import frame_number, readable
 from lightdepth.maps.convention import MapConvention, MapReading
 from lightdepth.ranges import Range
 from lightdepth.reporting.run import recorded, run_folder
@@ -101,7 +101,7 @@ def sparse(
 def _poses(given: str, frames: FrameSequence, source: SequenceSource, reading: MapReading) -> dict[int, np.ndarray]:
     """Known poses (4, 4) by frame number."""
     if given == "truth":
-        found = ((f.number, f.true_world_from_cam) for f in frames)
+        found = ((f.number, f.true_world_from_cam) for f in readable(frames, range(len(frames))))
         known = {number: pose for number, pose in found if pose is not None}
         if not known:
             raise InputError(frames.source, "no frame has a pose", "give --poses FILE, a TUM trajectory")

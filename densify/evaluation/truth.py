@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,8 +52,9 @@ def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bo
     """Poses of every frame and, where there is true depth, the wall. Frames are read once, one at a time.
 
     The true mesh is the one given; else C3VD's own, beside its frames; else the triangulated true depth of some frames.
-    Raises InputError when no frame has a pose.
+    A frame that cannot be read is left out with a warning. Raises InputError when no frame has a pose.
     """
+    unread: list[InputError] = []
     poses: dict[int, np.ndarray] = {}
     times: list[float] = []
     parts: list[tuple[np.ndarray, np.ndarray]] = []
@@ -65,7 +67,11 @@ def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bo
     def watched() -> Iterator[Frame]:
         nonlocal any_depth
         for i in order.tolist():
-            frame = frames[i]
+            try:
+                frame = frames[i]
+            except InputError as error:
+                unread.append(error)
+                continue
             if frame.true_world_from_cam is not None:
                 poses[frame.number] = frame.true_world_from_cam
             if frame.time is not None:
@@ -83,6 +89,11 @@ def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bo
     except InputError:
         if any_depth and with_surface:
             raise
+    if len(unread) == len(frames):
+        raise unread[0]
+    if unread:
+        found = f"{len(unread)} of {len(frames)} frames cannot be read and are no part of the truth ({unread[0]})"
+        warnings.warn(f"{frames.source}: {found}", stacklevel=2)
     if not poses:
         raise InputError(frames.source, "no frame has a true pose", "give them: a trajectory or a surface needs them")
     period = float(np.median(np.diff(times))) if len(times) > 1 else None
@@ -90,8 +101,8 @@ def read_truth(frames: FrameSequence, mesh: Path | None = None, with_surface: bo
     if cloud is None:
         return Truth(*common, None, "the sequence has true poses but no true depth" if with_surface else "")
     sampling = (
-        f"{len(cloud)} points: every second pixel of {len(frames)} frames unprojected at true poses, one point kept in "
-        f"each cube of {CUBE_MM:g} mm"
+        f"{len(cloud)} points: every second pixel of {len(frames) - len(unread)} frames unprojected at true poses, one "
+        f"point kept in each cube of {CUBE_MM:g} mm"
     )
     if mesh is not None:
         vertices, triangles = read_mesh(mesh)

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lightdepth.camera import Brown, CameraModel, Pinhole
-from lightdepth.datasets.sequence import FrameSequence, border_mask, readable
+from lightdepth.datasets.sequence import FrameSequence, border_mask
 from lightdepth.datasets.shown import check_shown
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, readable
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.pose_readings import AS_GIVEN, INVERSE, POSE_READINGS, as_is
 from lightdepth.sparse_map import check_rigid

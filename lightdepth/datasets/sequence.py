@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from lightdepth.files.headers import Header, header_of, what_is_there
 from lightdepth.files.images import ARRAY_SUFFIXES, PICTURE_SUFFIXES, image_size, read_image, read_raw
 from lightdepth.files.masks import read_two_parts
 from lightdepth.files.reading import reading
-from lightdepth.frame import Frame, frame_number
+from lightdepth.frame import Frame, frame_number, readable
 from lightdepth.option_names import option
 from lightdepth.sparse_map import Keyframe
 
@@ -94,7 +94,7 @@ class FrameSequence(Sequence[Frame]):
     def first(self) -> Frame:
         """The first frame that can be read, for what all have in common. Raises InputError, the very first one's, where
         none of the first hundred can."""
-        found = next((frame for i in range(min(len(self), 100)) for frame in readable(self, [i])), None)
+        found = next(readable(self, range(min(len(self), 100))), None)
         return self[0] if found is None else found
 
     def image_size(self) -> tuple[int, int]:
@@ -114,15 +114,6 @@ class FrameSequence(Sequence[Frame]):
         if frame is None:
             raise InputError(self.source, f"no frame number {number}", "expected the frames that the map was made of")
         return replace(frame, camera=keyframe.camera)
-
-
-def readable(sequence: FrameSequence, rows: Iterable[int]) -> list[Frame]:
-    """The frames at these rows, but for those that cannot be read."""
-    frames = []
-    for i in rows:
-        with suppress(InputError):
-            frames.append(sequence[i])
-    return frames
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lightdepth.datasets.sequence import FrameSequence, readable
+from lightdepth.datasets.sequence import FrameSequence
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, readable
 
 _SURELY_BLACK = 64
 """Frames that are black before a sequence is said to be."""
@@ -29,11 +29,10 @@ def check_shown(sequence: FrameSequence, frames: Sequence[Frame]) -> None:
         return
     rows = np.unique(np.linspace(0, len(sequence) - 1, _SURELY_BLACK).round().astype(int)).tolist()
     count = 0
-    for i in rows:  # one at a time: dozens would fill the memory
-        for frame in readable(sequence, [i]):
-            count += 1
-            if shows_something(frame):
-                return
+    for frame in readable(sequence, rows):  # one at a time: dozens would fill the memory
+        count += 1
+        if shows_something(frame):
+            return
     looked_at = f"{count} frames" if count == len(sequence) else f"{count} frames looked at, of {len(sequence)},"
     raise InputError(
         sequence.source,

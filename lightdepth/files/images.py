@@ -28,6 +28,7 @@ PICTURE_SUFFIXES = (
 ARRAY_SUFFIXES = (".npy",)
 """Arrays serve as pictures where there are no others: beside pictures they are predictions or truth."""
 _MOST_BYTES = 1 << 30
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # of a torn file our own sentence is enough
 _DECODE = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
 
 

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from lightdepth.datasets import FrameSequence
 from lightdepth.decline import V_FLOOR, masked_blur
 from lightdepth.errors import InputError
-from lightdepth.frame import FrameBatch, to_batch
+from lightdepth.frame import Frame, FrameBatch, readable, to_batch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.light.fit_on_map import GAMMA_RANGE, MU_RANGE, LightFit, at_bound
 from lightdepth.light.views import SATURATED
@@ -77,7 +77,7 @@ def fit_on_truth(frames: FrameSequence, rng: np.random.Generator | None = None, 
     """
     rng = np.random.default_rng(0) if rng is None else rng
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
-    found = [_pixels_of(frames, int(i), rng) for i in chosen]
+    found = [_pixels_of(frame, rng) for frame in readable(frames, chosen.tolist())]
     usable = [pixels for pixels in found if pixels is not None]
     if len(usable) < 4:
         raise InputError(
@@ -124,11 +124,8 @@ def fit_on_truth(frames: FrameSequence, rng: np.random.Generator | None = None, 
     )
 
 
-def _pixels_of(
-    frames: FrameSequence, index: int, rng: np.random.Generator, rows: int = 128, most: int = 1500
-) -> _Pixels | None:
+def _pixels_of(frame: Frame, rng: np.random.Generator, rows: int = 128, most: int = 1500) -> _Pixels | None:
     """Unsaturated pixels of known distance, away from edges of what is known; None when there are too few."""
-    frame = frames[index]
     if frame.true_distance is None:
         return None
     batch = to_batch(frame, working_size(frame.camera, min(rows, frame.camera.height)))

@@ -36,22 +36,32 @@ def frame_file(name: str) -> str:
 
 @dataclass(frozen=True)
 class Written:
-    """What went to the image folder: the camera, the valid pixels of the first frame, frame names by file name, and
-    what the images are like, in the order of file names."""
+    """What went to the image folder: the camera, the valid pixels of the first frame, frame names by file name, what
+    the images are like, in the order of file names, and why frames could not be read, by name."""
 
     camera: CameraModel
     valid: np.ndarray
     names: dict[str, str]
     measures: Measures
+    unread: dict[str, str]
 
 
 def write_images(frames: Sequence[Frame], images: Path, masks: Path, config: SfmConfig, progress: Progress) -> Written:
-    """Frames as PNG files, named by number so that they sort in time, each with its COLMAP mask (a.png: a.png.png)."""
+    """Frames as PNG files, named by number so that they sort in time, each with its COLMAP mask (a.png: a.png.png).
+    Those that cannot be read are left out; raises InputError where too few are left."""
 
     first: Frame | None = None
     meter: Meter | None = None
     names: dict[str, str] = {}
-    for done, frame in enumerate(frames, 1):
+    unread: dict[str, str] = {}
+    failed: InputError | None = None
+    for done in range(1, len(frames) + 1):
+        try:
+            frame = frames[done - 1]
+        except InputError as error:
+            failed = failed or error
+            unread[_name_of(frames, done - 1)] = f"cannot be read: {error.found}"
+            continue
         first = first or frame
         if frame.camera != first.camera:
             raise InputError(
@@ -73,12 +83,20 @@ def write_images(frames: Sequence[Frame], images: Path, masks: Path, config: Sfm
             write_image(folder / file, pixels)
         progress("images", done, len(frames))
     if first is None or meter is None or len(names) < config.min_model_size:
+        if failed is not None:
+            raise failed
         raise InputError(
             "the frames", f"{len(names)} of them", f"a sparse map needs at least {config.min_model_size}; {ADVICE}"
         )
     order, found = np.argsort(list(names)), meter.result()
     measures = Measures(*(getattr(found, f.name)[order] for f in fields(Measures)))
-    return Written(first.camera, first.valid, names, measures)
+    return Written(first.camera, first.valid, names, measures, unread)
+
+
+def _name_of(frames: Sequence[Frame], row: int) -> str:
+    """What a sequence calls a frame that it cannot read."""
+    names: Sequence[str] | None = getattr(frames, "names", None)
+    return f"frame {row}" if names is None else names[row]
 
 
 def evened(image: np.ndarray, valid: np.ndarray, limit: float) -> np.ndarray:

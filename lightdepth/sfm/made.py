@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from lightdepth.calibration import write_camera
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, readable
 from lightdepth.reporting.kept import kept
 from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run, plain
@@ -54,7 +54,7 @@ def made_sparse(
         for name, reason in found.failed.items():
             run.log(f"  {name}: {reason}")
     run.record["unregistered"] = found.failed
-    camera = frames[0].camera
+    camera = next(readable(frames, range(len(frames)))).camera
     if camera.provenance is None:
         return found
     write_camera(camera, run.folder / "camera.json")

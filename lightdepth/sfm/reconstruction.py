@@ -107,12 +107,13 @@ def sparse_map_from_frames(
         failed = {written.names[name]: reason for name, reason in zip(names, why, strict=True) if reason}
         if known is not None:
             failed = {n: r if frame_file(n) in known else "it has no known pose" for n, r in failed.items()}
+        failed |= written.unread
         if not count:
             size = f"{written.camera.width}x{written.camera.height}"
             raise InputError(
                 "the frames",
                 f"no sparse map could be made of {len(frames)} of {size}: COLMAP connected no "
-                f"{config.min_model_size} of them by {config.min_points} points ({summary(why)})",
+                f"{config.min_model_size} of them by {config.min_points} points ({summary(list(failed.values()))})",
                 ADVICE,
             )
         _write_sources(

@@ -17,7 +17,8 @@ from torch.utils.data import DataLoader, Dataset
 from lightdepth.datasets import open_sequence, write_c3vd
 from lightdepth.datasets.c3vd import C3VD
 from lightdepth.frame import Frame
-from train.datamodule import _Frames, collate
+from train.datamodule import _Frames
+from train.loader import collate
 
 AT_LEAST = 0.8
 """Least share of the bare rate."""

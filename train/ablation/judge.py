@@ -18,7 +18,7 @@ from lightdepth.reporting.progress import Progress
 from lightdepth.tube.variant import REFLECTANCE, variant_frames
 
 from ..colons import TubeData, tube_scene, with_reflectance
-from ..datamodule import collate
+from ..loader import collate
 from .rows import JudgedColons
 
 FARTHEST_MM = 100.0

@@ -8,6 +8,7 @@ import numpy as np
 
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
+from lightdepth.frame import readable
 from lightdepth.image_quality import Meter
 
 _LOOKED_AT = 64  # frames, evenly chosen
@@ -29,14 +30,14 @@ def check_exposed(parts: Sequence[FrameSequence]) -> None:
 
 
 def _empty(frames: FrameSequence) -> tuple[int, int, int]:
-    """How many frames are black, how many white, and how many were looked at."""
+    """How many frames are black, how many white, and how many were looked at: those that can be read."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(_LOOKED_AT, len(frames))).round().astype(int))
-    black = white = 0
-    for row in chosen.tolist():
-        frame = frames[row]
+    black = white = looked = 0
+    for frame in readable(frames, chosen.tolist()):
+        looked += 1
         meter = Meter(frame.valid)
         meter.add(np.rint(255 * np.clip(frame.image, 0, 1)).astype(np.uint8))
         found = meter.result()
         black += bool(found.dark[0] > _SHARE)
         white += bool(found.saturated[0] > _SHARE)
-    return black, white, len(chosen)
+    return black, white, looked

@@ -16,7 +16,7 @@ import numpy as np
 
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, readable
 from lightdepth.models import DepthModel, NetworkModel
 from lightdepth.module import MIN_RAY_Z
 from lightdepth.reporting.report import number
@@ -189,7 +189,8 @@ def parted(frames: FrameSequence, share: float) -> tuple[FrameSequence, FrameSeq
 
 def true_error(held: FrameSequence, model: DepthModel) -> float | None:
     """Mean AbsRel of depth over the held-out frames with truth, one median scale each; None where none has any."""
-    found = [error for frame in held if (error := _abs_rel(frame, model)) is not None]
+    read = readable(held, range(len(held)))
+    found = [error for frame in read if (error := _abs_rel(frame, model)) is not None]
     return float(np.mean(found)) if found else None
 
 

@@ -25,11 +25,11 @@ from torch import Tensor
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
-from lightdepth.frame import FrameBatch, to_batch
+from lightdepth.frame import FrameBatch, readable, to_batch
 from lightdepth.robust import lmeds_scale, mad_sigma, robust_weights
 from lightdepth.sparse_map import SparseMap, covisibility
 
-from ..datamodule import collate
+from ..loader import collate
 
 LEAST_POINTS = 8  # as many as alignment asks of a keyframe
 _NEIGHBOURS = 4  # keyframes that each meets: those that share most points with it
@@ -97,7 +97,7 @@ class MapTeacher:
 def _taught(
     frames: FrameSequence, sparse_map: SparseMap, withheld: set[int], hidden: Mapping[int, np.ndarray]
 ) -> list[TaughtKeyframe]:
-    camera = frames[0].camera
+    camera = frames.first().camera
     rows = {number: row for row, number in enumerate(frames.numbers)}
     found: list[TaughtKeyframe] = []
     for submap in sparse_map.submaps:
@@ -112,9 +112,9 @@ def _taught(
             pixels, seen = camera.project(points)
             distances = np.linalg.norm(points, axis=1)
             use = seen & (distances > 0)
-            if use.sum() >= LEAST_POINTS:
+            row = rows[keyframe.number]
+            if use.sum() >= LEAST_POINTS and any(readable(frames, [row])):
                 places = pixels[use] / (camera.width, camera.height)
-                row = rows[keyframe.number]
                 taught[index] = TaughtKeyframe(row, keyframe.cam_from_map, camera, places, distances[use])
         shared = covisibility(submap)
         place = {index: len(found) + n for n, index in enumerate(taught)}

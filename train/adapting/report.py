@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, readable
 from lightdepth.models import DeclineModel, DepthModel, NetworkModel
 from lightdepth.prediction import DepthPrediction
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
@@ -22,7 +22,8 @@ class Pictures:
 
     def __init__(self, target: Target) -> None:
         held = target.held
-        self._frames = [held[i] for i in sorted({round(k * (len(held) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)})]
+        rows = sorted({round(k * (len(held) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)})
+        self._frames = list(readable(held, rows))
         self._said: list[list[DepthPrediction]] = [[] for _ in self._frames]
         self.add(DeclineModel(details=False))
 

@@ -15,6 +15,7 @@ from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
 from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
+from lightdepth.frame import readable
 from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
 from lightdepth.losses import LossConfig
@@ -54,7 +55,7 @@ class Target:
 
     @property
     def light(self) -> PhotometricCalibration:
-        return self.frames[0].light
+        return self.frames.first().light
 
 
 def read_target(
@@ -76,8 +77,8 @@ def read_target(
     if sparse_map is not None:
         sparse_map = by_the_images(sparse_map, frames)
         check_shared_frames(sparse_map, frames)
-        check_pairing(sparse_map, frames, pairing, run, frames[0].camera if source.camera is not None else None)
-        write_camera(frames[0].camera, run.folder / "camera.json")
+        check_pairing(sparse_map, frames, pairing, run, frames.first().camera if source.camera is not None else None)
+        write_camera(frames.first().camera, run.folder / "camera.json")
         # The map's camera, where the folder has none: for all sequences.
         source = replace(source, camera=run.folder / "camera.json")
     else:
@@ -87,8 +88,8 @@ def read_target(
         if fitted is not None:
             frames, training, held = (with_light(part, fitted) for part in (frames, training, held))
             source = replace(source, light=str(run.folder / "light.json"))
-    write_light(frames[0].light, run.folder / "light.json")
-    run.log(f"light of {source.data}: {light_text(frames[0].light)}")
+    write_light(frames.first().light, run.folder / "light.json")
+    run.log(f"light of {source.data}: {light_text(frames.first().light)}")
     return Target(source, frames, training, held, sparse_map, unjudged)
 
 
@@ -96,7 +97,8 @@ def _made(
     run: Run, frames: FrameSequence, held: FrameSequence, config: AdaptConfig, sfm: SfmConfig
 ) -> tuple[SparseMap | None, str]:
     """A map made to judge or to teach, where one is needed, and why nothing judges, where that is so."""
-    has_truth = any(frame.true_distance is not None and (frame.true_distance > 0).any() for frame in held)
+    read = readable(held, range(len(held)))
+    has_truth = any(frame.true_distance is not None and (frame.true_distance > 0).any() for frame in read)
     if has_truth and not config.taught:
         return None, ""
     if config.judge == "none":

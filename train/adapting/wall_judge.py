@@ -127,7 +127,7 @@ class WallJudge:
 
 def wall_judge(frames: FrameSequence, held: FrameSequence, sparse_map: SparseMap, taught: bool, seed: int) -> WallJudge:
     """The map's keyframes among the frames as a judge; `taught` where the map teaches as well."""
-    views = map_views(frames, sparse_map, frames[0].camera)
+    views = map_views(frames, sparse_map, frames.first().camera)
     parts = {submap.id: _parted(submap, seed) for submap in sparse_map.submaps}
     return WallJudge(tuple(views), parts, frozenset(held.numbers), taught)
 

@@ -98,7 +98,7 @@ def adapt(
     with run_folder(output, "adapt", arguments, overwrite, resume) as run:
         run.hash_inputs(**source.files, map=map, checkpoint=Path(checkpoint))
         target = read_target(run, source, map, fit_light, config, start, sfm, pairing)
-        size = config.size or working_size(target.frames[0].camera, start.rows)
+        size = config.size or working_size(target.frames.first().camera, start.rows)
         data = frame_data(run, target, more, config, size, start)
         for doubt in data.doubts:
             run.warn(doubt)
