@@ -187,7 +187,8 @@ class Densified:
                 if len(self.results) > 1:
                     run.log(f"{name}: {result.verdict}")
             if result.coverage is not None:
-                text += f"; {result.coverage.well_share:.0%} of the wall seen well, {len(result.coverage.holes)} holes"
+                holes = len(result.coverage.holes)
+                text += f"; {result.coverage.well_share:.0%} of the wall seen well, {holes} hole{'s' * (holes != 1)}"
             if dense.unsure_share is not None:
                 text += f"; {unsure(dense.unsure_share, self.config)}"
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")

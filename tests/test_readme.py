@@ -1,4 +1,5 @@
-"""The README's commands: every one is understood, and all that take seconds on a small colon are run, in order."""
+"""The commands of the README and of the pages that teach: every one is understood, and all that take seconds on a small
+colon are run, in order."""
 
 from __future__ import annotations
 
@@ -19,9 +20,13 @@ from lightdepth.command_line.presets import with_preset
 from lightdepth.datasets import write_folder
 from lightdepth.tube.export import write_synthetic
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
-BLOCKS = re.split(r"^```.*$", README, flags=re.MULTILINE)[1::2]
-COMMANDS = [line for block in BLOCKS for line in block.splitlines() if line.startswith("lightdepth ")]
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+TAUGHT = ("video-to-surface", "training", "evaluation", "measuring", "exporting")
+PAGES = "\n".join([*((ROOT / "docs" / f"{name}.md").read_text() for name in TAUGHT), README])
+BLOCKS = re.split(r"^```.*$", PAGES, flags=re.MULTILINE)[1::2]
+LINES = [line for block in BLOCKS for line in block.splitlines() if line.startswith("lightdepth ")]
+COMMANDS = list(dict.fromkeys(line.split(" #")[0].strip() for line in LINES))
 MINUTES = (
     "bench",
     "ablate",
@@ -30,7 +35,8 @@ MINUTES = (
     "export lightdepth-self -o runs/onnx",
 )
 """Commands that take minutes: what they do is tested in modules of their own."""
-OTHER_DATA = ("--suite", "calib_results.txt", "--join", "joined_000", "lightdepth select", "--data.frames")
+OTHER_DATA = ("--suite", "calib_results.txt", "--join", "joined_000", "lightdepth select", "--data.frames", "runs/self")
+OTHER_DATA += ("densify DATA",)
 """Commands on data that the colon does not give (its small frames do not match); likewise."""
 
 PLACES = {
@@ -56,15 +62,21 @@ def words_of(command: str) -> list[str]:
     return shlex.split(command, comments=True)[1:]
 
 
-def test_the_readme_shows_every_verb():
-    shown = {words_of(command)[0] for command in COMMANDS} | set(re.findall(r"`lightdepth ([a-z-]+)", README))
-    told = re.findall(r"lightdepth ([a-z-]+)", README)
+def test_the_pages_show_every_verb():
+    shown = {words_of(command)[0] for command in COMMANDS} | set(re.findall(r"`lightdepth ([a-z-]+)", PAGES))
+    told = re.findall(r"lightdepth ([a-z-]+)", PAGES)
     verbs = {entry.name for entry in metadata.entry_points(group=GROUP)}
     assert len(COMMANDS) > 40 and verbs - {"demo"} <= shown | set(told) and "make demo" in README
 
 
+def test_the_readme_is_short_and_shows_pictures_that_are_there():
+    shown = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", README)
+    assert len(README.splitlines()) <= 150 and len(shown) >= 2
+    assert sum((ROOT / picture).stat().st_size for picture in shown) < 3e6
+
+
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_of_the_readme_is_understood(command):
+def test_every_command_of_the_pages_is_understood(command):
     verb, *words = words_of(re.sub(r"\b[xyzuv]\b(?=[,\]])", "1", command))  # places are the reader's
     (entry,) = metadata.entry_points(group=GROUP, name=verb)
     if verb in ("bench", "train"):  # which parse their own words

@@ -1,0 +1,49 @@
+"""The pictures of the README, from what `make demo` made: python docs/pictures/make.py runs/demo"""
+
+from __future__ import annotations
+
+import base64
+import re
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+FIGURE = re.compile(r'src="data:image/png;base64,([^"]+)"[^>]*><figcaption>([^<]*)')
+HERE = Path(__file__).parent
+HEIGHT, GAP = 300, 12
+
+
+def figures(report: Path, map_id: int) -> dict[str, np.ndarray]:
+    """The pictures (H, W, 3) of a map in a report, by the beginning of their caption."""
+    text = report.read_text(encoding="utf-8")
+    section = text[text.index(f">Map {map_id}</h2>") :]
+    found: dict[str, np.ndarray] = {}
+    for data, caption in FIGURE.findall(section):
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        found.setdefault(re.split(r"[:,;(]", caption)[0].strip(), picture)
+    return found
+
+
+def row(pictures: list[np.ndarray]) -> np.ndarray:
+    """Pictures side by side, of one height, with white between them."""
+    gap = np.full((HEIGHT, GAP, 3), 255, np.uint8)
+    scaled = [
+        cv2.resize(p, (round(p.shape[1] * HEIGHT / len(p)), HEIGHT), interpolation=cv2.INTER_AREA) for p in pictures
+    ]
+    return np.concatenate([each for picture in scaled for each in (picture, gap)][:-1], 1)
+
+
+def main(run: Path) -> None:
+    found = figures(run / "report.html", 1)
+    contact = next(picture for caption, picture in found.items() if re.fullmatch(r"\d+\.png", caption))
+    inside = next(picture for caption, picture in found.items() if caption.startswith("From keyframe"))
+    cv2.imwrite(str(HERE / "frames.jpg"), row([contact, inside]), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    surface = found["Surface of map 1 from outside"]
+    error = cv2.imread(str(run / "map_001_error.png"))
+    cv2.imwrite(str(HERE / "surface.jpg"), row([surface, error]), [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
