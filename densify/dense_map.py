@@ -33,15 +33,23 @@ DOUBTED = 0.03
 """Expected error of a vertex, as a share of the distance of a typical inlier, at which its confidence is one half."""
 
 
+_FAR = 16  # times its size, twice the distance from the origin: from there on it is taken about its own middle
+
+
 class Surface:
-    """A mesh that rays can be cast at: vertices (n, 3), triangles (m, 3)."""
+    """A mesh that rays can be cast at: vertices (n, 3), triangles (m, 3). In single precision, about its own middle
+    where it is far from the origin."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
         self._core = native.open3d().core
         self._scene = native.open3d().t.geometry.RaycastingScene() if len(triangles) else None
+        self._middle = np.zeros(3)
         if self._scene is not None:
+            low, high = vertices.min(0), vertices.max(0)
+            if np.abs(low + high).max() > _FAR * np.ptp(vertices, axis=0).max():
+                self._middle = (low + high) / 2
             faces = self._core.Tensor(triangles.astype(np.uint32))
-            self._scene.add_triangles(self._core.Tensor(vertices.astype(np.float32)), faces)
+            self._scene.add_triangles(self._core.Tensor((vertices - self._middle).astype(np.float32)), faces)
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Distance (n,) along unit rays (n, 3) from origins (n, 3) or (3,) to the surface; infinite where there is
@@ -52,7 +60,8 @@ class Surface:
         """Distances as of `cast`, and the triangle (n,) that each ray meets, -1 where there is none."""
         if self._scene is None or not len(directions):
             return np.full(len(directions), np.inf), np.full(len(directions), -1)
-        rays = np.concatenate([np.broadcast_to(origins, directions.shape), directions], -1).astype(np.float32)
+        starts = np.broadcast_to(origins - self._middle, directions.shape)
+        rays = np.concatenate([starts, directions], -1).astype(np.float32)
         found = self._scene.cast_rays(self._core.Tensor(rays))
         distance = found["t_hit"].numpy().astype(np.float64)
         return distance, np.where(np.isfinite(distance), found["primitive_ids"].numpy().astype(int), -1)
@@ -61,15 +70,15 @@ class Surface:
         """Distance (n,) from points (n, 3) to the closest of the surface, in single precision; infinite without any."""
         if self._scene is None or not len(points):
             return np.full(len(points), np.inf)
-        found = self._scene.compute_distance(self._core.Tensor(points.astype(np.float32)))
+        found = self._scene.compute_distance(self._core.Tensor((points - self._middle).astype(np.float32)))
         result: np.ndarray = found.numpy().astype(np.float64)
         return result
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The points (n, 3) of the surface that are closest to points (n, 3), and their triangles (n,)."""
         assert self._scene is not None, "a surface without triangles has no points"
-        found = self._scene.compute_closest_points(self._core.Tensor(points.astype(np.float32)))
-        return found["points"].numpy().astype(np.float64), found["primitive_ids"].numpy().astype(int)
+        found = self._scene.compute_closest_points(self._core.Tensor((points - self._middle).astype(np.float32)))
+        return found["points"].numpy().astype(np.float64) + self._middle, found["primitive_ids"].numpy().astype(int)
 
 
 @dataclass(frozen=True)

@@ -220,3 +220,15 @@ def test_a_cloud_without_normals_has_points_and_colours_only(tmp_path):
     np.testing.assert_array_equal(read.vertices, points)
     np.testing.assert_array_equal(np.asarray(read.colors)[:, :3], [[1, 2, 3], [250, 0, 9]])
     assert b"nx" not in (tmp_path / "c.ply").read_bytes()
+
+
+@pytest.mark.parametrize("off", [0.0, 5e6])
+def test_a_surface_is_as_exact_far_from_the_origin_as_near(off):
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) + off
+    surface = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    above = np.array([[0.25, 0.5, 0.125], [0.75, 0.25, 0.25]]) + off
+    assert surface.distance(above) == pytest.approx([0.125, 0.25], abs=1e-6)
+    distance, triangle = surface.meet(above, np.array([[0, 0, -1.0]]).repeat(2, 0))
+    assert distance == pytest.approx([0.125, 0.25], abs=1e-6) and triangle.tolist() == [1, 0]
+    places, _ = surface.closest(above)
+    assert places - off == pytest.approx(np.array([[0.25, 0.5, 0], [0.75, 0.25, 0]]), abs=1e-6)
