@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS = 1
 # Some hundred processes import the same modules: compiled once, for all of them.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-slow fuzz mutants kill soak offline coverage lint format bench same ablation ablation-paper clean
+.PHONY: setup demo test test-slow fuzz mutants kill soak offline coverage docs lint format bench same ablation ablation-paper clean
 
 setup: $(VENV)/.ready
 
@@ -62,6 +62,10 @@ soak: setup
 WHAT ?=
 offline: setup
 	bash tests/offline.sh $(WHAT)
+
+# A static site of README, docs/ and cards, in site/: nothing in it asks the network for anything.
+docs: setup
+	$(BIN)/mkdocs build --strict --quiet
 
 lint: setup
 	$(BIN)/ruff check .
