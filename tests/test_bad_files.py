@@ -364,6 +364,13 @@ def test_members_that_unpack_to_gigabytes_are_refused(tmp_path):
         numbered_members(tmp_path, "b", r"b(\d+)\.json").all()  # type: ignore[union-attr]
 
 
+def test_an_archive_that_is_no_gzip_is_not_tried_by_what_takes_the_memory_it_asks_for(tmp_path):
+    header = b".\xff\xff\xff\xff" + (1 << 23).to_bytes(8, "little")  # LZMA's, with a dictionary of 4 GB
+    (tmp_path / "a.tar.gz").write_bytes(header + bytes(5000))
+    with little_memory(), refused(where="a.tar.gz", found="not a readable archive"):
+        numbered_members(tmp_path, "a", r"a(\d+)\.json").all()  # type: ignore[union-attr]
+
+
 # ---- meshes and videos
 
 

@@ -11,7 +11,7 @@ import tarfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 from lightdepth.datasets.sequence import numbered_files
 from lightdepth.errors import InputError
@@ -101,7 +101,10 @@ class Archive:
 
     def _open(self) -> None:
         if self._process != os.getpid():  # a data loader's worker must not share the place in the file
-            self._tar = tarfile.open(self._path, "r:*", tarinfo=_Member)  # noqa: SIM115 - the next frame goes on from here
+            # Gzip or nothing: what unpacks LZMA takes as much memory as a file's first bytes ask for.
+            with self._path.open("rb") as file:
+                mode: Literal["r:gz", "r:"] = "r:gz" if file.read(2) == b"\x1f\x8b" else "r:"
+            self._tar = tarfile.open(self._path, mode, tarinfo=_Member)  # noqa: SIM115 - the next frame goes on from here
             self._found, self._complete, self._members, self._process = {}, False, 0, os.getpid()
 
     def _next(self) -> int | None:
