@@ -22,6 +22,7 @@ def validation_losses(log: Path) -> list[float]:
     return [float(line.split("validation loss")[1].split()[0]) for line in lines]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_checkpoint_trained_on_colons_densifies_another_colon(tmp_path, capsys):
     first = train(tmp_path / "run", 80)

@@ -306,8 +306,9 @@ def test_two_overlapping_halves_of_the_sinus_are_joined(realdata, seed):
     assert scale < 0.02 and degrees < 1 and by == "points"
 
 
-@pytest.mark.parametrize("by", ["looks", pytest.param("surface", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("seed", [400, pytest.param(401, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("by", ["looks", "surface"])
+@pytest.mark.parametrize("seed", [400, 401])
 def test_two_halves_of_the_sinus_without_a_common_frame_are_joined_by_the_surface_that_both_see(realdata, seed, by):
     """By the points on it that look alike, which is tried first, and by its shape alone."""
     scale, degrees, found = joined_error(realdata, (range(17), range(17, 35)), seed, MergeConfig(by=(by,)))
