@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import posixpath
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ LINK = re.compile(r"(\]\()(?![a-z]+:|#)([^)#\s]+)(#[^)\s]*)?\)")
 ELSEWHERE = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "data/**/*.md", "lightdepth/weights/*.md")
 
 
+@cache
 def places() -> dict[str, str]:
     """Where each page and picture of the site is, by where it lies in the repository."""
     found = {"README.md": "index.md"}

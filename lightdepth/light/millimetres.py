@@ -23,10 +23,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import torch
 
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
-from lightdepth.photometry import PhotometricCalibration
+from lightdepth.photometry import PhotometricCalibration, irradiance
+from lightdepth.radiosity import form_factors
 
 _RHO = (0.0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6)
 _RANGE, _STEPS = (0.4, 2.5), 13  # of the scale about the one that is expected
@@ -164,8 +166,11 @@ class _Shading:
         use = np.isfinite(log_v).sum(0) >= 2
         places, normals, log_v = places[use], normals[use], log_v[:, use]
         _, blocks = np.unique(np.floor(places / (_BLOCK * typical)), axis=0, return_inverse=True)
-        between = _form_factors(elements, element_normals, elements, element_normals, areas)
-        onto = _form_factors(places, normals, elements, element_normals, areas)
+        # Places have no area: they receive, and light nothing.
+        wall = [np.concatenate(both) for both in ((elements, places), (element_normals, normals))]
+        given = np.concatenate([areas, np.zeros(len(places))])
+        shares = form_factors(_batch(wall[0]), _batch(wall[1]), _batch(given))[0].numpy()
+        between, onto = shares[: len(elements), : len(elements)], shares[len(elements) :, : len(elements)]
         poses = np.stack([look.cam_from_map for look in looks])
         known = np.isfinite(log_v)
         blocks = blocks.ravel()
@@ -224,12 +229,18 @@ def _lit(
     points: np.ndarray, normals: np.ndarray, pose: np.ndarray, light: PhotometricCalibration, scale: float
 ) -> np.ndarray:
     """Direct light (n,) on places in the map from a camera's pose."""
-    towards = points @ pose[:3, :3].T + pose[:3, 3] - np.asarray(light.position_mm) / scale
-    reach = np.linalg.norm(towards, axis=1)
-    towards = towards / reach[:, None]
-    cosine = -(towards * (normals @ pose[:3, :3].T)).sum(1)
-    result: np.ndarray = np.exp(-light.mu * (1 - towards @ np.asarray(light.direction))) * cosine.clip(0) / reach**2
+    at = points @ pose[:3, :3].T + pose[:3, 3]
+    reach = np.linalg.norm(at, axis=1)
+    terms = light.terms(torch.float64)
+    turned, rays = (_batch(v.T)[:, :, None] for v in (normals @ pose[:3, :3].T, at / reach[:, None]))
+    lit = irradiance(_batch(reach)[:, None, None], turned, rays, terms._replace(position=terms.position / scale))
+    result: np.ndarray = lit.numpy().ravel()
     return result
+
+
+def _batch(array: np.ndarray) -> torch.Tensor:
+    """A batch of one."""
+    return torch.from_numpy(np.ascontiguousarray(array, np.float64))[None]
 
 
 def _to_map(
@@ -256,21 +267,6 @@ def _elements(
     length = np.linalg.norm(turned, axis=1)
     use = (length > 0.3 * total) & (total > 0)
     return place[use] / total[use, None], turned[use] / length[use, None], most[use]
-
-
-def _form_factors(
-    to: np.ndarray, to_normals: np.ndarray, of: np.ndarray, normals: np.ndarray, areas: np.ndarray
-) -> np.ndarray:
-    """Share (n, m) of what places receive that comes from elements, as lightdepth.radiosity has it."""
-    between = of[None] - to[:, None]
-    squared = (between**2).sum(-1)
-    between /= np.sqrt(np.maximum(squared, 1e-12))[..., None]
-    cosines = np.einsum("nmi,ni->nm", between, to_normals).clip(0) * -np.einsum("nmi,mi->nm", between, normals).clip(
-        max=0
-    )
-    factors = cosines * areas / (np.pi * np.maximum(squared + areas / 6, 1e-12))
-    result: np.ndarray = factors / np.maximum(factors.sum(1, keepdims=True), 1)
-    return result
 
 
 def _seen(look: Look, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
