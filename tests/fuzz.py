@@ -204,13 +204,28 @@ def tried(parser: Any, sample: Any, data: bytes, folder: Path) -> tuple[bool, st
     except InputError as error:
         cause: BaseException | None = error
         while cause is not None:
-            if isinstance(cause, MemoryError):
+            if isinstance(cause, MemoryError) and not _refused_by_ffmpeg(cause, parser, target):
                 return True, f"MemoryError behind: {error}"[:300]
             cause = cause.__cause__
         return True, ""
     except (Exception, Hang) as error:
         place = [f for f in traceback.extract_tb(error.__traceback__) if "site-packages" not in f.filename][-1]
         return True, f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {error}"[:300]
+
+
+def _refused_by_ffmpeg(error: MemoryError, parser: Any, target: Path) -> bool:
+    """FFmpeg says the same of a table longer than any that it makes as of memory that the limit withholds. So it
+    is asked again without the limit: whether it needs less then than a process may take."""
+    if not type(error).__module__.startswith("av."):
+        return False
+    limit, peak = resource.getrlimit(resource.RLIMIT_AS), _peak()
+    resource.setrlimit(resource.RLIMIT_AS, (limit[1], limit[1]))
+    try:
+        with suppress(Exception):
+            parser.read(target)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limit)
+    return (_peak() - peak) * 2**20 < MOST_BYTES
 
 
 def laid_out(sample: Any, folder: Path) -> None:

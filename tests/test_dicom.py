@@ -256,6 +256,15 @@ def test_items_without_end_and_elements_longer_than_the_file_are_refused(folder)
         open_clip(folder / "e.dcm")
 
 
+@pytest.mark.parametrize("length", [0, 7, 2**31])
+def test_a_jpeg_2000_picture_with_a_box_of_no_length_is_refused_and_not_read_for_ever(folder, length):
+    data = write_dicom(folder / "a.dcm", images(1), "JPEG 2000").read_bytes()
+    at = data.index(b"ftyp", data.index(b"jP  ")) - 4
+    (folder / "b.dcm").write_bytes(data[:at] + struct.pack(">I", length) + data[at + 4 :])
+    with refused(found="whose boxes are broken"):
+        open_clip(folder / "b.dcm")
+
+
 def test_several_files_of_a_series_are_named_and_one_is_asked_for(folder):
     for i in range(6):
         write_dicom(folder / f"IM{i:05d}", images(1))

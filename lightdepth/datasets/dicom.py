@@ -28,6 +28,7 @@ from lightdepth.datasets.dicom_parts import (
     frames_in_items,
     items_of,
     native_frames,
+    out_of_boxes,
     pixel_element,
 )
 from lightdepth.datasets.video import VideoFile
@@ -224,6 +225,7 @@ def _decoded(data: bytes, header: DicomHeader, where: str) -> np.ndarray:
     """(H, W, 3) RGB of one frame's bytes."""
     pydicom = _pydicom(where)
     if header.syntax not in _NATIVE:
+        data = out_of_boxes(data, where)  # pydicom stays in a box of length 0 for ever
         inside = header_in(data) if header.syntax != _RLE else None
         if inside is not None and (inside.width, inside.height) != (header.width, header.height):
             raise InputError(

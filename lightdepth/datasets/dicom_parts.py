@@ -20,6 +20,7 @@ _ITEM, _END = 0xE000FFFE, 0xE0DDFFFE  # (FFFE,E000) and (FFFE,E0DD), as they rea
 _UNDEFINED = 0xFFFFFFFF
 _MOST_ITEMS = 10**7
 _STARTS = (b"\xff\xd8", b"\xff\x4f\xff\x51")  # of a JPEG and of a JPEG 2000 picture
+_IN_BOXES = b"\0\0\0\x0cjP  "  # how a JPEG 2000 file begins, which some programs put where its codestream belongs
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,24 @@ def frames_in_items(stream: BinaryIO, offsets: list[int], items: list[Part], ann
             frames.append([])
         frames[-1].append(item)
     return [tuple(parts) for parts in frames[:announced]]
+
+
+def out_of_boxes(picture: bytes, where: str) -> bytes:
+    """A frame's bytes, without the boxes of a JPEG 2000 file around its codestream (ISO 15444-1, annex I)."""
+    at = 0 if picture.startswith(_IN_BOXES) else len(picture)
+    while at + 16 <= len(picture):
+        length, kind = struct.unpack(">I4s", picture[at : at + 8])
+        head = 8
+        if length == 1:
+            head, length = 16, struct.unpack(">Q", picture[at + 8 : at + 16])[0]
+        if kind == b"jp2c":
+            return picture[at + head :]
+        if length < head:  # 0 is a last box, to the end
+            break
+        at += length
+    if picture.startswith(_IN_BOXES):
+        raise InputError(where, "a JPEG 2000 picture whose boxes are broken", "copy it again, or export it anew")
+    return picture
 
 
 def _begins(stream: BinaryIO, item: Part) -> bool:
