@@ -19,7 +19,7 @@ from lightdepth.sparse_map import Keyframe, Submap
 
 _MOST_DOUBTED = 0.5  # share of a submap's keyframes that may be left out; where more are doubted, the wall is as it is
 
-_FINER_ROUNDS = 3  # from fields that agree: more change them by about a thousandth
+_FINER_ROUNDS = 3  # from fields that agree: more change them by .002 (RMS of log distance; the grid adds .005)
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,11 @@ from typing import Annotated
 import numpy as np
 
 from lightdepth.brief import Brief
+from lightdepth.errors import InputError
 from lightdepth.prediction import DepthPrediction
 from lightdepth.ranges import above, at_least, checked
+
+_LEAST = 1e-6  # deviation: one that is smaller still bends nothing either, and its square leaves double precision
 
 
 @dataclass(frozen=True)
@@ -38,13 +41,14 @@ class BendingConfig:
     finer: Annotated[int, at_least(0, up_to=64)] = 9
     """Number n of bumps across and down, n x n, of one more grid, which the bends of a submap get as far as the images
     speak for what it adds (judge.parallax): a map whose points are right bends depth in finer detail than one whose
-    points err together. More follow points more closely and take longer; 0 leaves it out, and live always does."""
+    points err together. 2 or more; more follow points more closely and take longer. 0 leaves it out, and live always
+    does."""
     slope_deviation: Annotated[float, at_least(0)] = 0.25
     """How strongly the factor on distance is expected to change with distance itself (standard deviation, a ratio:
     change of the factor's log per change of the log of predicted distance), besides over the image; a soft limit, 0
     for no such change. A larger one lets near wall be stretched against far wall more freely."""
-    bump_deviation: Annotated[float, above(0)] = 0.1
-    """Expected size (standard deviation) of each bump of the bend, in log distance (0.1 is 10 %), above 0. A larger one
+    bump_deviation: Annotated[float, at_least(_LEAST)] = 0.1
+    """Expected size (standard deviation) of each bump of the bend, in log distance (0.1 is 10 %). A larger one
     lets depth bend more strongly."""
 
     layers: Annotated[int, at_least(0, up_to=64)] = 7
@@ -57,9 +61,13 @@ class BendingConfig:
     reach: Annotated[float, above(0)] = 0.35
     """Step, in log distance (0.35 is a factor of 1.4), from layer to layer, and how far wall has to be from points in
     distance to keep the network's own shape. A larger one makes a smoother bend, which reaches farther from points."""
-    layer_deviation: Annotated[float, above(0)] = 0.1
+    layer_deviation: Annotated[float, at_least(_LEAST)] = 0.1
     """Expected size (standard deviation) of each bump of a layer, in log distance (0.1 is 10 %). A larger one lets near
     wall bend more strongly against far wall."""
+
+    def __post_init__(self) -> None:
+        if self.finer == 1:
+            raise InputError("the bend's finer grid", "1 bump", "expected 0, for none, or 2 and more across the image")
 
     def with_finer(self) -> BendingConfig:
         """The same with the finer grid among the others."""
@@ -70,7 +78,7 @@ class BendingConfig:
         """Prior precision of each weight (m,); 0 for the scale, which has no prior."""
         if not self.on:
             return np.zeros(1)
-        slope = [self.slope_deviation**-2] if self.slope_deviation else []
+        slope = [max(self.slope_deviation, _LEAST) ** -2] if self.slope_deviation else []
         bumps = [np.full(n * n, self.bump_deviation**-2) for n in self.grids]
         layers = np.full(self.layers * (1 + self.columns**2), self.layer_deviation**-2)
         return np.concatenate([[0.0], slope, *bumps, layers])
@@ -114,13 +122,13 @@ class Bend(Brief):
             parts.append((np.clip(log_distance, *self.log_range) - self.log_middle)[:, None])
         for n in self.config.grids:
             across, down, mean = _bumps(x[:, 0], n), _bumps(x[:, 1], n), _mean(n)
-            parts.append((down[:, :, None] * across[:, None, :] - np.outer(mean, mean)).reshape(len(x), -1))
+            parts.append((down[:, :, None] * across[:, None, :] - np.outer(mean, mean)).reshape(len(x), n * n))
         count, n = self.config.layers, self.config.columns
         if count:
             layers = np.stack([self._layer(log_distance, k) for k in range(count)], 1)
             across, down, mean = _bumps(x[:, 0], n), _bumps(x[:, 1], n), _mean(n)
-            own = (down[:, :, None] * across[:, None, :] - np.outer(mean, mean)).reshape(len(x), 1, -1)
-            parts += [layers, (layers[:, :, None] * own).reshape(len(x), -1)]
+            own = (down[:, :, None] * across[:, None, :] - np.outer(mean, mean)).reshape(len(x), 1, n * n)
+            parts += [layers, (layers[:, :, None] * own).reshape(len(x), count * n * n)]
         return np.concatenate(parts, 1)
 
     def along(self, x: np.ndarray, log_distance: np.ndarray) -> np.ndarray:

@@ -103,6 +103,16 @@ def test_a_single_keyframe_and_a_constant_depth_are_no_trouble():
     assert np.isfinite(distance).all() and np.median(distance[first.valid]) == pytest.approx(middle, rel=0.2)
 
 
+def test_depth_with_holes_in_every_other_column_has_no_overlap_to_speak_of_and_is_no_trouble():
+    predictions = [tilted(f) for f in scene()[0]]
+    holes = np.arange(predictions[0].valid.shape[1]) % 2 == 1
+    predictions = [replace(p, valid=p.valid & ~holes) for p in predictions]
+    views = views_of(predictions)
+    assert not any(len(view.grid(16)) for view in views) and all(len(view.observed) > 100 for view in views)
+    bends = agree(views, scene()[3], AgreementConfig(), BendingConfig())
+    assert max(errors(bends, predictions)) < 0.02
+
+
 def test_what_floats_before_a_nearer_view_s_surface_is_contradicted_and_truth_is_not():
     frames, _, _, shared = scene()
     right = [truth(f) for f in frames]

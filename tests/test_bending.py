@@ -69,7 +69,7 @@ def test_invalid_pixels_do_not_matter():
     assert np.isfinite(other).all()
 
 
-@pytest.mark.parametrize(("changes", "what"), [({"grids": (1,)}, "from 2 to 64"), ({"bump_deviation": 0.0}, "above 0")])
+@pytest.mark.parametrize(("changes", "what"), [({"grids": (1,)}, "from 2 to 64"), ({"bump_deviation": 0.0}, "at least 1e-06")])
 def test_bendings_that_are_none_are_refused(changes, what):
     with refused(what):
         BendingConfig(**changes)
@@ -128,3 +128,11 @@ def test_a_finer_grid_adds_nothing_before_it_is_fitted(layers):
     assert finer.config.grids == (5, 7) and len(finer.weights) == len(finer.config.precision)
     np.testing.assert_allclose(finer.field(log), bend.field(log), rtol=1e-12)
     assert finer.scale == bend.scale
+
+
+def test_one_bump_is_no_finer_grid_and_the_smallest_deviations_are_numbers():
+    with refused(found="1 bump", cure="0, for none, or 2 and more"):
+        BendingConfig(finer=1)
+    with refused(found="1e-200"):
+        BendingConfig(bump_deviation=1e-200)
+    assert np.isfinite(BendingConfig(slope_deviation=1e-200, bump_deviation=1e-6, layer_deviation=1e-6).precision).all()
