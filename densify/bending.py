@@ -41,7 +41,7 @@ class BendingConfig:
     finer: Annotated[int, at_least(0, up_to=64)] = 9
     """Number n of bumps across and down, n x n, of one more grid, which the bends of a submap get as far as the images
     speak for what it adds (judge.parallax): a map whose points are right bends depth in finer detail than one whose
-    points err together. 2 or more; more follow points more closely and take longer. 0 leaves it out, and live always
+    points err together. More follow points more closely and take longer, at least 2; 0 leaves it out, and live always
     does."""
     slope_deviation: Annotated[float, at_least(0)] = 0.25
     """How strongly the factor on distance is expected to change with distance itself (standard deviation, a ratio:

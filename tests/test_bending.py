@@ -69,7 +69,9 @@ def test_invalid_pixels_do_not_matter():
     assert np.isfinite(other).all()
 
 
-@pytest.mark.parametrize(("changes", "what"), [({"grids": (1,)}, "from 2 to 64"), ({"bump_deviation": 0.0}, "at least 1e-06")])
+@pytest.mark.parametrize(
+    ("changes", "what"), [({"grids": (1,)}, "from 2 to 64"), ({"bump_deviation": 0.0}, "at least 1e-06")]
+)
 def test_bendings_that_are_none_are_refused(changes, what):
     with refused(what):
         BendingConfig(**changes)
