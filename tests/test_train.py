@@ -1,6 +1,7 @@
 """Training: runs that write what they say, go on where they ended, and stop with a diagnosis."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -389,11 +390,16 @@ def test_a_frame_that_cannot_be_read_is_left_out_and_said_whichever_process_read
     runs, said = [], []
     for workers in ("0", "2"):
         (tmp_path / workers).mkdir()
-        with pytest.warns(UserWarning, match="left out of training, with the next frame in its place: .*0003.png"):
-            options = ["--data.num_workers", workers, "--data.held_out", "0.2"]
-            runs.append(quick(tmp_path / workers, *options, sequence=sequence))
-        said.append(sorted(json.loads((runs[-1] / "run.json").read_text())["warnings"]))
-    assert said[0] == said[1] and len(said[0]) == 2 and "frames/0011.png: not a readable image" in said[0][1]
+        runs.append(
+            quick(tmp_path / workers, "--data.num_workers", workers, "--data.held_out", "0.2", sequence=sequence)
+        )
+        record, log = (json.loads((runs[-1] / "run.json").read_text()), (runs[-1] / "log.txt").read_text())
+        assert record["frames"] == {"train": 10, "val": 2} and record["unread"] == {"train": 1, "val": 1}
+        said.append(sorted(record["warnings"]))
+        assert all(log.count(f"warning: {sentence}") == 1 for sentence in said[-1])
+    assert said[0] == said[1] and len(said[0]) == 2
+    assert re.match("left out of training, with the next frame in its place: .*0003.png: not a readable", said[0][0])
+    assert re.match("left out of validation: .*0011.png: not a readable image", said[0][1])
     assert equal(*map(state, runs))
 
 

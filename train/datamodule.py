@@ -7,7 +7,9 @@ resumed run sees what an uninterrupted one would have seen.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -131,7 +133,9 @@ class FrameDataModule(pl.LightningDataModule):
         self.sequences, self.val_sequences = config.sequences or [], config.val_sequences or []
         self.size, self.batch_size = (int(config.size[0]), int(config.size[1])), config.batch_size
         self.colours: dict[str, Colours] = {}
-        self._unread: dict[str, str] = {}  # what is said of frames that cannot be read, by file
+        self._unread: dict[str, dict[str, str]] = {"train": {}, "val": {}}  # what is said of frames, by file
+        self.tell: Callable[[str], None] = warn
+        """takes a sentence on a frame that could not be read, when it is met"""
         check_apart(self.sequences, self.val_sequences)
         self._train: ConcatDataset[FrameBatch] | None = None
         self._val: ConcatDataset[FrameBatch] | None = None
@@ -192,7 +196,21 @@ class FrameDataModule(pl.LightningDataModule):
         """Sentences on training sequences that are not what the light's decline can teach from, and on frames that
         could not be read until now."""
         coloured = [f"{path}: {doubt}" for path, colours in self.colours.items() for doubt in colours.doubts]
-        return [*coloured, *self._unread.values()]
+        return [*coloured, *(said for part in self._unread.values() for said in part.values())]
+
+    @property
+    def unread(self) -> dict[str, int]:
+        """Number of frames to train and to validate on that could not be read until now, in this process."""
+        return {part: len(said) for part, said in self._unread.items()}
+
+    def gather(self) -> None:
+        """Takes what the other processes of a distributed run could not read; each of them has to call it."""
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            everywhere: list[dict[str, dict[str, str]]] = [{}] * torch.distributed.get_world_size()
+            torch.distributed.all_gather_object(everywhere, self._unread)
+            for part, said in self._unread.items():
+                for other in everywhere:
+                    said |= other[part]
 
     def share(self, other: FrameDataModule) -> bool:
         """Takes the frames of `other`, which is set up, if they are what `setup` would read and render."""
@@ -263,11 +281,11 @@ class FrameDataModule(pl.LightningDataModule):
             alone = self.trainer is None or self.trainer.world_size == 1
             sampler.go_on(epoch, batch * self.batch_size if alone else 0)
         full = len(self._train) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
-        return self._loader(self._train, sampler, drop_last=full)
+        return self._loader(self._train, "train", sampler, drop_last=full)
 
     def val_dataloader(self) -> DataLoader[FrameBatch]:
         assert self._val is not None
-        return self._loader(self._val)
+        return self._loader(self._val, "val")
 
     def on_after_batch_transfer(self, batch: FrameBatch, dataloader_idx: int) -> FrameBatch:
         if self.config.reflectance_error:
@@ -287,14 +305,22 @@ class FrameDataModule(pl.LightningDataModule):
         return batch
 
     def _loader(
-        self, dataset: Dataset[FrameBatch], order: Shuffled | None = None, drop_last: bool = False
+        self, dataset: Dataset[FrameBatch], part: str, order: Shuffled | None = None, drop_last: bool = False
     ) -> DataLoader[FrameBatch]:
-        return loader(dataset, self.batch_size, self.config.num_workers, self._left_out, order, drop_last)
+        left_out = partial(self._left_out, part)
+        workers, replacing = self.config.num_workers, part == "train"  # an error counts once
+        return loader(dataset, self.batch_size, workers, left_out, order, drop_last, replacing)
 
-    def _left_out(self, error: InputError) -> None:
-        if error.where not in self._unread:
-            self._unread[error.where] = f"left out of training, with the next frame in its place: {error}"
-            warnings.warn(self._unread[error.where], stacklevel=2)
+    def _left_out(self, part: str, error: InputError) -> None:
+        said = self._unread[part]
+        if error.where not in said:
+            of = "training, with the next frame in its place" if part == "train" else "validation"
+            said[error.where] = f"left out of {of}: {error}"
+            self.tell(said[error.where])
+
+
+def warn(sentence: str) -> None:
+    warnings.warn(sentence, stacklevel=3)
 
 
 def held_out_count(frames: int, share: float) -> int:

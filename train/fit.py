@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import lightning.pytorch as pl
@@ -41,7 +42,7 @@ from .callbacks import validation_line
 from .card import Card, Doubt
 from .checkpoints import BEST, LAST, Start, clear_cut_off, newest
 from .colons import TubeData
-from .datamodule import FrameDataModule
+from .datamodule import FrameDataModule, warn
 from .folder import begin_in, first_process, has_checkpoint, training_folder
 from .going_on import settings_before, warn_of_length, warn_of_settings
 from .requeue import requeued
@@ -143,6 +144,7 @@ def _fitted(
     )
     for sentence in data.doubts:
         echo(f"warning: {sentence}")
+    data.tell = partial(_warned, echo)
     checkpoints = folder / "checkpoints"
     with finishing_first() as received:
         options = _with_callbacks(trainer_options, folder, echo, data, job.settings, received, start)
@@ -163,6 +165,7 @@ def _fitted(
     chosen = checkpoints / (BEST if (checkpoints / BEST).exists() else LAST)
     found = trainer.validate(model, datamodule=data, ckpt_path=chosen, verbose=False, weights_only=True)[0]
     errors = {key.removeprefix("val/"): float(value) for key, value in found.items()}
+    data.gather()
     if trainer.is_global_zero:
         final = f"train loss {float(train_loss):.4g}  " if train_loss is not None else ""
         echo(f"final: {final}{validation_line(found)}")
@@ -211,12 +214,20 @@ def _exported(
         "inputs": {echo.names.of(path): input_hash(Path(path)) for path in [*data.sequences, *data.val_sequences]},
         "split": data.split and echo.names.of(data.split),
         "frames": data.counts,
+        "unread": data.unread,
         "steps": steps,
         "units": {"rmse_mm": "mm", "medae_mm": "mm", "distance": "up to scale"},
         "errors": errors,
         "warnings": data.doubts,
         "colour": {echo.names.of(path): colours.record() for path, colours in data.colours.items()},
     }
+
+
+def _warned(echo: Echo, sentence: str) -> None:
+    if first_process():
+        echo(f"warning: {sentence}")
+    else:  # of other processes the log says nothing
+        warn(sentence)
 
 
 def _left(output: Path, flagged: bool) -> str:

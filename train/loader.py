@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Sequence, Sized
+from pathlib import Path
 from typing import NamedTuple, cast
 
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from lightdepth.errors import InputError
+from lightdepth.errors import InputError, MachineFailure
 from lightdepth.frame import FrameBatch
 from lightdepth.photometry import LightTerms
 from train.order import Shuffled
@@ -25,13 +26,16 @@ def loader(
     left_out: Callable[[InputError], None],
     order: Shuffled | None = None,
     drop_last: bool = False,
+    replacing: bool = True,
 ) -> DataLoader[FrameBatch]:
     """Batches of a dataset whose items are batches of one, in an `order` or its own.
 
-    In the place of an item that cannot be read stands the next one that can: `left_out` is told of each, in this
-    process. Raises InputError where a score of items after one another cannot be read."""
+    In the place of an item that cannot be read stands the next one that can, or, where not `replacing`, none: that
+    batch is smaller. `left_out` is told of each, in this process. Raises, in this process too, InputError where a score
+    of items after one another cannot be read, or none at all, and what the machine does wrong (OSError, MachineFailure,
+    MemoryError)."""
     return _Loader(
-        _Readable(dataset),
+        _Readable(dataset, replacing),
         left_out,
         sampler=order,
         drop_last=drop_last,
@@ -52,36 +56,54 @@ def collate(batches: Sequence[FrameBatch]) -> FrameBatch:
 
 
 class _Item(NamedTuple):
-    """A batch, or none, and what could not be read before it was found. What is raised in a worker would come back as
-    another exception."""
+    """A batch, or none; what could not be read before it was found; what ends the loading. Values, since what is raised
+    in a worker would come back as another exception."""
 
     batch: FrameBatch | None
-    unread: tuple[InputError, ...]
+    unread: tuple[InputError, ...] = ()
+    failed: Exception | None = None
 
 
 class _Readable(Dataset[_Item]):
-    """The items of a dataset; in the place of one that cannot be read the next one that can."""
+    """The items of a dataset; in the place of one that cannot be read the next one that can, or none."""
 
-    def __init__(self, dataset: Dataset[FrameBatch]) -> None:
-        self.dataset = dataset
+    def __init__(self, dataset: Dataset[FrameBatch], replacing: bool) -> None:
+        self.dataset, self.replacing = dataset, replacing
 
     def __len__(self) -> int:
         return len(cast(Sized, self.dataset))
 
     def __getitem__(self, index: int) -> _Item:
         unread: tuple[InputError, ...] = ()
-        for row in range(index, index + min(len(self), _MOST_UNREAD)):
+        for row in range(index, index + (min(len(self), _MOST_UNREAD) if self.replacing else 1)):
             try:
                 return _Item(self.dataset[row % len(self)], unread)
             except InputError as error:
+                if isinstance(error.__cause__, MemoryError):  # the frame was good when there was room for it
+                    return _Item(None, failed=MemoryError())
+                if (folder := Path(error.where).parent) and not folder.exists():
+                    return _Item(
+                        None, failed=MachineFailure(f"{folder}: the folder that frames were read from is gone")
+                    )
                 unread += (error,)
-        return _Item(None, unread)
+            except (OSError, MachineFailure, MemoryError) as error:
+                return _Item(None, failed=error)
+        return _Item(None, unread, _none_of(unread) if self.replacing else None)
+
+
+def _none_of(unread: Sequence[InputError]) -> InputError:
+    first, last = unread[0], unread[-1]
+    if first is last:
+        return first
+    found = f"{first.found}, and none of the {len(unread) - 1} frames behind it can be read, up to {last.where}"
+    return InputError(first.where, found, first.cure)
 
 
 def _collated(items: Sequence[_Item]) -> _Item:
     batches = [item.batch for item in items if item.batch is not None]
-    whole = len(batches) == len(items)
-    return _Item(collate(batches) if whole else None, tuple(error for item in items for error in item.unread))
+    unread = tuple(error for item in items for error in item.unread)
+    failed = next((item.failed for item in items if item.failed is not None), None)
+    return _Item(collate(batches) if batches and failed is None else None, unread, failed)
 
 
 class _Loader(DataLoader[FrameBatch]):
@@ -92,12 +114,22 @@ class _Loader(DataLoader[FrameBatch]):
         self.left_out = left_out
 
     def __iter__(self) -> Iterator[FrameBatch]:  # type: ignore[override]  # Lightning asks for no more
-        for batch, unread in cast(Iterator[_Item], super().__iter__()):
-            if batch is None:
-                raise unread[0]
+        read, unreadable, failed = False, None, None
+        for batch, unread, failed in cast(Iterator[_Item], super().__iter__()):
+            if failed is not None:
+                break
             for error in unread:
+                unreadable = unreadable or error
                 self.left_out(error)
-            yield batch
+            if batch is not None:
+                read = True
+                yield batch
+        if failed is None and (read or unreadable is None):
+            return
+        # Workers end with the iterator that holds them, at once: with the traceback it would be in a cycle, whose
+        # queues are closed first, so that it waits for workers that nothing reaches.
+        self._iterator = None
+        raise failed or cast(InputError, unreadable)
 
 
 def _outliving_a_signal(worker: int) -> None:

@@ -44,6 +44,7 @@ def reading(
         raise InputError(path, f"not {what} ({said(error)})", cure) from error
     except OSError as error:
         if error.errno in FAILS:
+            error.filename = error.filename or str(path)  # a file that is open already says no name
             raise
         raise InputError(
             error.filename or path,
