@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import multiprocessing
 import os
 import shutil
 import signal
@@ -116,8 +117,10 @@ def test_a_folder_that_is_gone_is_the_machine_s_doing(tmp_path, workers):
         read(Frames(folder, 6, raising), workers)
 
 
-def test_a_worker_that_is_killed_is_told_as_the_machine_s_doing(tmp_path):
+def test_a_worker_that_is_killed_is_told_as_the_machine_s_doing_and_the_others_end(tmp_path):
+    killed = Frames(tmp_path, 6, lambda i: os.kill(os.getpid(), signal.SIGKILL) if i == 2 else None)
     with pytest.raises(RuntimeError) as raised:
-        read(Frames(tmp_path, 6, lambda i: os.kill(os.getpid(), signal.SIGKILL)), 1)
+        read(killed, 2)
     failure = machine_failure(raised.value, tmp_path, "Its checkpoints are kept: --resume goes on")
     assert failure is not None and "--data.num_workers 0" in str(failure) and str(failure).endswith("--resume goes on")
+    assert not multiprocessing.active_children()

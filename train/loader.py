@@ -115,18 +115,23 @@ class _Loader(DataLoader[FrameBatch]):
 
     def __iter__(self) -> Iterator[FrameBatch]:  # type: ignore[override]  # Lightning asks for no more
         read, unreadable, failed = False, None, None
-        for batch, unread, failed in cast(Iterator[_Item], super().__iter__()):
-            if failed is not None:
-                break
-            for error in unread:
-                unreadable = unreadable or error
-                self.left_out(error)
-            if batch is not None:
-                read = True
-                yield batch
+        try:
+            for batch, unread, failed in cast(Iterator[_Item], super().__iter__()):
+                if failed is not None:
+                    break
+                for error in unread:
+                    unreadable = unreadable or error
+                    self.left_out(error)
+                if batch is not None:
+                    read = True
+                    yield batch
+        except RuntimeError as error:
+            if "DataLoader worker" not in str(error):
+                raise
+            failed = RuntimeError(str(error))  # killed; without tracebacks, also those of its causes
         if failed is None and (read or unreadable is None):
             return
-        # Workers end with the iterator that holds them, at once: with the traceback it would be in a cycle, whose
+        # Workers end with the iterator that holds them, at once: with a traceback it would be in a cycle, whose
         # queues are closed first, so that it waits for workers that nothing reaches.
         self._iterator = None
         raise failed or cast(InputError, unreadable)
