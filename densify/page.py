@@ -84,7 +84,7 @@ def densify_page(
         page.text(note)
     scene = scene_of(results, gallery.thumbnails.found, merged, errors)
     if scene is not None:
-        page.heading("The surface, to be turned")
+        page.heading("The surface in three dimensions")
         page.scene(scene)
     if figures is not None:
         _errors(page, figures)

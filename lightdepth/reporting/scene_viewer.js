@@ -4,7 +4,7 @@
  */
 
 const USED = [0.16, 0.5, 0.85], LEFT_OUT = [0.6, 0.6, 0.6], CHOSEN = [1.0, 0.62, 0.1], PATH = [0.16, 0.5, 0.85];
-const OUTSIDE = 0.36; /* tangent of half of what is seen from outside, downwards */
+const OUTSIDE = 0.36; /* the least of Viewer.tangent */
 
 /* Elements of the page. */
 
@@ -56,15 +56,16 @@ class Viewer {
     this.keyframe = element("select", {});
     this.picture = element("figure", { className: "scene-picture", hidden: true });
     this.picture.setAttribute("aria-live", "polite");
-    const which = element("label", { hidden: this.told.surfaces.length < 2 }, "Surface ", this.surface);
+    const which = element("label", { className: "scene-which", hidden: this.told.surfaces.length < 2 }, "Surface ", this.surface);
     this.path = group("Path", element("label", {}, "Ride inside ", this.ride), this.back,
       element("label", {}, "Keyframe ", this.keyframe));
     this.root.append(
       element("p", { className: "scene-how", textContent: "Drag to turn, wheel or two fingers to come nearer, Shift and " +
         "drag to move; a click on a camera shows its picture." }),
-      element("div", { className: "scene-view" }, this.canvas, this.legend),
+      element("div", { className: "scene-view" }, this.canvas, this.picture),
+      this.legend,
       element("div", { className: "scene-controls" }, which, this.layers, this.shown, this.path),
-      this.note, this.picture);
+      this.note);
   }
 
   /* Shows another surface, as it is looked at first. */
@@ -94,6 +95,7 @@ class Viewer {
     }));
     this.path.hidden = !poses.length;
     this.ride.max = Math.max(poses.length - 1, 0);
+    this.ride.value = 0;
     const drawn = this.now.count / 3;
     this.note.textContent = (drawn < of ? `Shown with ${drawn} of ${of} triangles; the files have all.`
       : `All ${of} triangles are shown.`) + (told.points_of > 1 ? ` One in ${told.points_of} points is shown.` : "");
@@ -163,11 +165,16 @@ class Viewer {
     this.redraw();
   }
 
+  /* Of half of what is seen from outside, downwards: a narrow canvas shows the whole width of the surface too. */
+  tangent() {
+    return Math.max(OUTSIDE, (0.53 * this.canvas.clientHeight) / Math.max(this.canvas.clientWidth, 1));
+  }
+
   camera() {
     const aspect = this.canvas.width / this.canvas.height;
     if (this.inside === null) {
       const eye = along(this.target, -this.distance, this.axes[2]);
-      const reach = Math.hypot(...eye) + 2 * this.now.extent, tangent = OUTSIDE / Math.min(aspect, 1);
+      const reach = Math.hypot(...eye) + 2 * this.now.extent, tangent = this.tangent();
       return { axes: this.axes, eye, aspect, tangent, near: Math.max(0.005 * this.distance, 1e-4 * reach), far: reach };
     }
     const { axes, eye } = this.now.riding(this.inside), [x, y] = this.now.told.tangents;
@@ -267,7 +274,7 @@ class Viewer {
 
   move(dx, dy) {
     if (this.inside !== null) return;
-    const pixel = (2 * this.distance * OUTSIDE) / Math.max(this.canvas.clientHeight, 1);
+    const pixel = (2 * this.distance * this.tangent()) / Math.max(this.canvas.clientHeight, 1);
     this.target = along(along(this.target, -pixel * dx, this.axes[0]), -pixel * dy, this.axes[1]);
     this.redraw();
   }
