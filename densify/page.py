@@ -14,7 +14,7 @@ from densify.joining import Merged, joined_name
 from densify.judging.verdict import spoke
 from densify.pipeline import SubmapResult
 from densify.predictions import SeenKeyframe
-from densify.scene import KINDS, TRUSTED, Thumbnails, scene_of, seen_kinds, tangents
+from densify.scene import KINDS, SURFACE_FILES, TRUSTED, Thumbnails, scene_of, seen_kinds, surface_of, tangents
 from lightdepth.camera import CameraModel
 from lightdepth.reporting.figures import (
     BAD,
@@ -29,6 +29,7 @@ from lightdepth.reporting.figures import (
     thumbnail,
 )
 from lightdepth.reporting.report import Report, number
+from lightdepth.reporting.scene import Surface
 from lightdepth.sparse_map import SparseMap, Submap
 
 
@@ -45,7 +46,7 @@ class Gallery:
         self.thumbnails = Thumbnails(sparse_map)
 
     def __call__(self, submap: Submap, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
-        self.thumbnails(aligned, seen)
+        self.thumbnails(aligned.keyframe.name, seen)
         if (submap.id, aligned.keyframe.number) not in self._chosen or seen.frame is None or seen.prediction is None:
             return
         assert aligned.observed is not None
@@ -82,7 +83,7 @@ def densify_page(
     page = Report(title)
     for note in notes:
         page.text(note)
-    scene = scene_of(results, gallery.thumbnails.found, merged, errors)
+    scene = scene_of(_surfaces(results, merged, errors), gallery.thumbnails.found)
     if scene is not None:
         page.heading("The surface in three dimensions")
         page.scene(scene)
@@ -133,15 +134,26 @@ def joined_section(page: Report, merged: Merged) -> None:
                 page.figures(row)
 
 
+def _surfaces(results: Sequence[SubmapResult], merged: Merged | None, errors: Sequence[ErrorMesh]) -> list[Surface]:
+    """The joined surfaces, then those of submaps that are in none of them."""
+    joined = [] if merged is None else list(zip(merged.results, merged.groups, strict=True))
+    joined = [(result, group) for result, group in joined if len(result.dense.triangles)]
+    within = {map_id for _, group in joined for map_id in group}
+    distances = {mesh.name: mesh.distance for mesh in errors}
+    surfaces = [
+        surface_of(f"{joined_name(result)}: maps {', '.join(map(str, sorted(group)))} as one", result.dense)
+        for result, group in joined
+    ]
+    for dense in (r.dense for r in results if r.dense.submap.id not in within):
+        number = dense.submap.id
+        surfaces.append(surface_of(f"map {number}", dense, distances.get(f"map_{number:03d}")))
+    return surfaces
+
+
 FILES = {
     "joined_*/mesh.*": "the joined surface",
-    "map_*/mesh.*": "the surface",
+    **SURFACE_FILES,
     "*_error.ply": "the surface coloured by its distance from the truth",
-    "*/cloud.ply": "its vertices alone",
-    "*/sparse.ply": "the points of the map, green used, red found wrong",
-    "*/keyframes.csv": "scale, inliers and reasons for each keyframe",
-    "*/trajectory.tum": "the path of the camera",
-    "*/camera.json": "the camera",
     "metrics.md": "errors against the truth, in tables",
     "metrics.json": "the same, for programs",
     "cumulative_error.png": "the share of the surface within each error",

@@ -1,19 +1,15 @@
-"""What a densify run shows in three dimensions: its surfaces, the joined ones first, the points that they rest on, and
-the cameras with their pictures."""
+"""What a dense map shows in three dimensions: its surface, the points that it rests on, and its cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
-from densify.aligned import AlignedKeyframe
 from densify.coverage import seen_well
 from densify.dense_map import GREEN, GREY, RED, DenseMap
 from densify.evaluation.pictures import FARTHEST_COLOR_MM, error_colors
-from densify.evaluation.records import ErrorMesh
-from densify.joining import Merged, joined_name
-from densify.pipeline import SubmapResult
 from densify.predictions import SeenKeyframe
 from lightdepth.camera import CameraModel
 from lightdepth.reporting.figures import PLAIN, MeshView, colored_distance, jpeg, level_colors, outside_axes, thumbnail
@@ -24,10 +20,22 @@ SEEN_WELL, SEEN_WEAKLY, DOUBTFUL = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15), (0.8, 
 TRUSTED = 0.2
 """Confidence below which wall is red: it is expected to be off by twice what is doubted."""
 
+SURFACE_FILES = {
+    "map_*/mesh.*": "the surface",
+    "*/cloud.ply": "its vertices alone",
+    "*/sparse.ply": "the points of the map, green used, red found wrong",
+    "*/keyframes.csv": "scale, inliers and reasons for each keyframe",
+    "*/trajectory.tum": "the path of the camera",
+    "*/camera.json": "the camera",
+}
+"""What the files of a surface are, by pattern."""
+
 PICTURES = 24
 """The most keyframes whose pictures a scene has."""
 _WIDTH = 240  # of such a picture
-_TRIANGLES = 250_000  # of all surfaces together
+TRIANGLES = Scene.most
+"""The most triangles that are shown of a surface."""
+_TOGETHER = 250_000  # triangles of all surfaces
 _FEWEST = 4_000  # of each, however many there are
 
 
@@ -40,42 +48,26 @@ class Thumbnails:
         self._chosen = {names[i] for i in rows}
         self.found: dict[str, Picture] = {}
 
-    def __call__(self, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
-        name = aligned.keyframe.name
+    def __call__(self, name: str, seen: SeenKeyframe) -> None:
         if name not in self._chosen or name in self.found or seen.frame is None or seen.prediction is None:
             return
         depth = colored_distance(seen.prediction.distance, seen.prediction.valid)
         self.found[name] = Picture(*(jpeg(thumbnail(each, _WIDTH), 80) for each in (seen.frame.image, depth)))
 
 
-def scene_of(
-    results: Sequence[SubmapResult],
-    pictures: Mapping[str, Picture],
-    merged: Merged | None = None,
-    errors: Sequence[ErrorMesh] = (),
-) -> Scene | None:
-    """The joined surfaces, then the submaps that are in none of them; None where there is no surface. `errors` are the
-    surfaces' distances from the truth, by the names of their folders."""
-    joined = [] if merged is None else list(zip(merged.results, merged.groups, strict=True))
-    named = [
-        (f"{joined_name(r)}: maps {', '.join(map(str, sorted(group)))} as one", joined_name(r), r.dense)
-        for r, group in joined
-    ]
-    within = {i for r, group in joined if len(r.dense.triangles) for i in group}
-    alone = [r.dense for r in results if r.dense.submap.id not in within]
-    named += [(f"map {d.submap.id}", f"map_{d.submap.id:03d}", d) for d in alone]
-    named = [each for each in named if len(each[2].triangles)]
-    if not named:
+def scene_of(surfaces: Sequence[Surface], pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene | None:
+    """The surfaces that have a triangle, the first of them in a still picture too; None where there is none. Many are
+    shown with fewer triangles each."""
+    shown = tuple(surface for surface in surfaces if len(surface.triangles))
+    if not shown:
         return None
-    distances = {mesh.name: mesh.distance for mesh in errors}
-    first = named[0][2]
-    still = jpeg(MeshView.of(first.vertices, first.triangles).picture(first.colors))
-    most = max(min(Scene.most, _TRIANGLES // len(named)), _FEWEST)
-    surfaces = tuple(_surface(title, dense, distances.get(name)) for title, name, dense in named)
-    return Scene(surfaces, still, pictures, most)
+    still = MeshView.of(shown[0].vertices, shown[0].triangles).picture(shown[0].layers[0].colors())
+    return Scene(shown, jpeg(still), pictures, max(min(TRIANGLES, _TOGETHER // len(shown)), _FEWEST))
 
 
-def _surface(title: str, dense: DenseMap, distance: np.ndarray | None) -> Surface:
+def surface_of(title: str, dense: DenseMap, distance: np.ndarray | None = None) -> Surface:
+    """All that is shown of a dense map. `distance` (n,) [mm] is that of its vertices from the truth, where there is
+    any."""
     judged, inlier = dense.judged_points()
     points = dense.submap.points
     clouds = (
@@ -83,19 +75,16 @@ def _surface(title: str, dense: DenseMap, distance: np.ndarray | None) -> Surfac
         Cloud("Points found wrong", points[judged & ~inlier], RED),
         Cloud("Points not judged", points[~judged], GREY),
     )
-    poses = tuple(
-        Pose(k.name, k.cam_from_map, a.ok) for k, a in zip(dense.submap.keyframes, dense.alignments, strict=True)
-    )
-    middle = dense.submap.keyframes[len(dense.submap.keyframes) // 2]
+    keyframes = dense.submap.keyframes
     return Surface(
         title,
         dense.vertices,
         dense.triangles,
         _layers(dense, distance),
         tuple(cloud for cloud in clouds if len(cloud.points)),
-        poses,
-        tangents(middle.camera),
-        outside_axes(dense.vertices),
+        tuple(Pose(k.name, k.cam_from_map, a.ok) for k, a in zip(keyframes, dense.alignments, strict=True)),
+        tangents(keyframes[len(keyframes) // 2].camera),
+        outside_axes(dense.vertices) if len(dense.vertices) else np.eye(3),
     )
 
 

@@ -16,7 +16,7 @@ from densify.config import DensifyConfig
 from densify.evaluation.records import ErrorMesh
 from densify.page import FILES, Gallery, densify_page
 from densify.pipeline import densify
-from densify.scene import PICTURES, Thumbnails, scene_of
+from densify.scene import PICTURES, Thumbnails, scene_of, surface_of
 from lightdepth.reporting.figures import jpeg
 from lightdepth.reporting.names import names_of
 from lightdepth.reporting.report import Report
@@ -56,7 +56,7 @@ def grid(side: int) -> tuple[np.ndarray, np.ndarray]:
 def test_the_scene_of_a_report_has_the_surfaces_triangles_its_places_and_its_colours(made, tmp_path):
     result, gallery = made
     dense, page = result.dense, tmp_path / "report.html"
-    scene = scene_of([result], gallery.thumbnails.found)
+    scene = scene_of([surface_of("map 0", result.dense)], gallery.thumbnails.found)
     report = Report("A surface")
     report.scene(replace(scene, most=len(dense.triangles)))
     report.write(page)
@@ -70,11 +70,13 @@ def test_the_scene_of_a_report_has_the_surfaces_triangles_its_places_and_its_col
     assert np.abs(unpacked(confidence["values"]) / 255 - dense.confidence).max() <= 0.5 / 255 + 1e-6
 
 
-def test_the_scene_has_the_cameras_of_the_path_the_points_by_kind_and_the_errors_that_are_known(made):
+def test_the_scene_has_the_cameras_of_the_path_the_points_by_kind_and_the_errors_that_are_known(made, tmp_path):
     result, gallery = made
     dense = result.dense
     errors = [ErrorMesh("map_000", dense.vertices, dense.triangles, np.linspace(0, 5, len(dense.vertices)))]
-    scene = json.loads(scene_of([result], gallery.thumbnails.found, errors=errors).text())
+    page = densify_page("Maps", [result], gallery, [], errors=errors)
+    page.write(tmp_path / "report.html")
+    scene = scene_in((tmp_path / "report.html").read_text(encoding="utf-8"))
     (told,) = scene["surfaces"]
     keyframes = dense.submap.keyframes
     assert [pose["name"] for pose in told["poses"]] == [k.name for k in keyframes]
@@ -113,7 +115,7 @@ def test_a_report_with_a_scene_refers_to_nothing_outside_fits_a_phone_and_has_wo
 
 def test_a_report_that_is_made_twice_is_the_same_to_the_byte(made, tmp_path):
     result, gallery = made
-    scene = replace(scene_of([result], gallery.thumbnails.found), most=1500)
+    scene = replace(scene_of([surface_of("map 0", result.dense)], gallery.thumbnails.found), most=1500)
     assert len(result.dense.triangles) > 2 * 1500
     assert scene.text() == scene.text() != replace(scene, most=1400).text()
 

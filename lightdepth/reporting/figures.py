@@ -19,24 +19,29 @@ PLAIN = (0.82, 0.8, 0.78)
 
 def png(image: np.ndarray) -> bytes:
     """PNG of an RGB image (H, W, 3), uint8 or float in [0, 1]."""
-    if image.dtype != np.uint8:
-        image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    done, data = cv2.imencode(".png", cv2.cvtColor(_eight_bits(image), cv2.COLOR_RGB2BGR))
     assert done
     return data.tobytes()
 
 
 def jpeg(image: np.ndarray, quality: int = 88) -> bytes:
-    """JPEG of an RGB image (H, W, 3) uint8: for what has no sharp edges, a fifth of the size of a PNG."""
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    """JPEG of an RGB image (H, W, 3), uint8 or float in [0, 1]: of an image or a surface, a fifth of the PNG's size."""
+    image = cv2.cvtColor(_eight_bits(image), cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done
     return data.tobytes()
 
 
+def _eight_bits(image: np.ndarray) -> np.ndarray:
+    if image.dtype == np.uint8:
+        return image
+    found: np.ndarray = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return found
+
+
 def thumbnail(image: np.ndarray, width: int) -> np.ndarray:
     """An RGB image (H, W, 3) at another width, as uint8."""
-    if image.dtype != np.uint8:
-        image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    image = _eight_bits(image)
     height = max(1, round(image.shape[0] * width / image.shape[1]))
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 

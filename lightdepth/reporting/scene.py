@@ -11,7 +11,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,13 @@ class Layer:
     """(k, 3) uint8 RGB"""
     legend: tuple[tuple[float, str], ...] = ()
     """Places in [0, 1] along the palette, and what they mean."""
+
+    def colors(self) -> np.ndarray | None:
+        """(n, 3) in [0, 1]; None where all vertices have one colour."""
+        if self.values is None:
+            return None
+        found: np.ndarray = (self.values if self.palette is None else self.palette[self.values]) / 255
+        return found
 
     def of(self, rows: np.ndarray) -> Layer:
         """The same for some of the vertices."""
@@ -74,6 +81,15 @@ class Surface:
     """Tangents of half of what the camera sees, across and down."""
     axes: np.ndarray = field(default_factory=lambda: np.eye(3))
     """(3, 3), rows right, down, forward: from where it is looked at first."""
+    made: int | None = None
+    """Number of triangles before it was thinned; None where it was not."""
+
+    def thinned(self, most: int) -> Surface:
+        """The same with at most some `most` triangles."""
+        vertices, triangles, rows = thinned(self.vertices, self.triangles, most)
+        layers = tuple(layer.of(rows) for layer in self.layers)
+        made = len(self.triangles) if self.made is None else self.made
+        return replace(self, vertices=vertices, triangles=triangles, layers=layers, made=made)
 
 
 @dataclass(frozen=True)
@@ -111,15 +127,15 @@ class Scene:
 
 
 def _surface(surface: Surface, most: int, most_points: int) -> dict[str, Any]:
-    vertices, triangles, rows = thinned(surface.vertices, surface.triangles, most)
+    surface = surface.thinned(most)
     stride = -(-sum(len(cloud.points) for cloud in surface.clouds) // most_points)
     return {
         "title": for_terminal(surface.title),
-        "triangles_made": len(surface.triangles),
+        "triangles_made": surface.made,
         "points_of": stride,
-        "vertices": _places(vertices),
-        "triangles": packed(triangles, np.uint16 if len(vertices) <= _STEPS else np.uint32),
-        "layers": [_layer(layer.of(rows)) for layer in surface.layers],
+        "vertices": _places(surface.vertices),
+        "triangles": packed(surface.triangles, np.uint16 if len(surface.vertices) <= _STEPS else np.uint32),
+        "layers": [_layer(layer) for layer in surface.layers],
         "clouds": [
             {"title": c.title, "color": list(c.color), "points": _places(c.points[:: max(stride, 1)])}
             for c in surface.clouds
