@@ -13,9 +13,10 @@ import pytest
 from colons import colon, sequence, slam, truth
 
 from densify.config import DensifyConfig
+from densify.dense_map import DenseMap
 from densify.evaluation.records import ErrorMesh
-from densify.page import FILES, Gallery, densify_page
-from densify.pipeline import densify
+from densify.page import FILES, Gallery, _surfaces, densify_page
+from densify.pipeline import SubmapResult, densify
 from densify.scene import PICTURES, Thumbnails, scene_of, surface_of
 from lightdepth.reporting.figures import jpeg
 from lightdepth.reporting.names import names_of
@@ -90,6 +91,18 @@ def test_the_scene_has_the_cameras_of_the_path_the_points_by_kind_and_the_errors
     assert titles == ["Of the images", "Shape alone", "Confidence", "How well seen", "Error"]
     assert [picture["name"] for picture in scene["pictures"]] == [k.name for k in keyframes]
     assert all(unpacked(p[kind])[:2].tolist() == [0xFF, 0xD8] for p in scene["pictures"] for kind in ("image", "depth"))
+
+
+def test_joined_surfaces_come_first_and_submaps_that_are_in_none_after_them(made):
+    (result, _), empty = made, DenseMap.empty(made[0].dense.submap, "nothing")
+
+    def numbered(number: int, dense: DenseMap = result.dense) -> SubmapResult:
+        return replace(result, dense=replace(dense, submap=replace(dense.submap, id=number)))
+
+    merged = SimpleNamespace(results=[numbered(0), numbered(1, empty)], groups=[{2: None, 0: None}, {3: None, 4: None}])
+    found = scene_of(_surfaces([numbered(i) for i in range(5)], merged, []))
+    assert [s.title for s in found.surfaces] == ["joined_000: maps 0, 2 as one", "map 1", "map 3", "map 4"]
+    assert scene_of(_surfaces([numbered(0, empty)], None, [])) is None
 
 
 def test_a_report_with_a_scene_refers_to_nothing_outside_fits_a_phone_and_has_words_for_its_pictures(made, tmp_path):
