@@ -158,7 +158,6 @@ FILES = {
     "metrics.json": "the same, for programs",
     "cumulative_error.png": "the share of the surface within each error",
     "uncertainty.json": "the factor that calibrates the predicted uncertainty",
-    "config.yaml": "the settings of this run",
 }
 """What the files of a run are, by pattern."""
 

@@ -136,7 +136,9 @@ def test_the_verb_writes_surfaces_timings_and_what_they_say(data, tmp_path, caps
     rows = list(csv.DictReader((run / "timings.csv").open()))
     assert sum(counts) == sum(int(r["new_points"]) for r in rows) > 0
     page = (run / "report.html").read_text(encoding="utf-8")
-    assert "Agreement with the map ahead" in page and 'href="map_001/mesh.ply"' in page
+    assert "Agreement with the map ahead" in page
+    links = re.findall('href="([^"]+)"', page)
+    assert {"map_001/mesh.ply", "run.json"} < set(links) and all((run / link).is_file() for link in links)
     (scene,) = re.findall(r'<script type="application/json">(.*?)</script>', page)
     shown = json.loads(scene)["surfaces"]
     assert [s["title"] for s in shown] == ["map 0", "map 1"] and all(s["triangles_made"] > 100 for s in shown)

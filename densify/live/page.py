@@ -16,7 +16,6 @@ from lightdepth.reporting.scene import Scene
 FILES = {
     **SURFACE_FILES,
     "timings.csv": "what each keyframe's time went into",
-    "config.yaml": "the settings of this run",
 }
 """What the files of a run are, by pattern."""
 

@@ -24,7 +24,6 @@ FILES = {
     "light.json": "the light",
     "mask.png": "white where tissue shows",
     "times.csv": "when each frame was taken",
-    "config.yaml": "the settings of this run",
 }
 """What the files of a run are, by pattern."""
 

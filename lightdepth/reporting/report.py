@@ -22,6 +22,11 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-
 
 _VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 _JPEG = b"\xff\xd8"
+_OF_EVERY_RUN = [
+    ("config.yaml", "the settings of this run"),
+    ("log.txt", "what it said"),
+    ("run.json", "what was done, with figures, versions and warnings"),
+]
 _OPENERS = "MeshLab, CloudCompare and Blender"
 
 
@@ -51,16 +56,15 @@ class Report:
         )
 
     def files(self, folder: Path, what: Mapping[str, str]) -> None:
-        """Links to what a run wrote into the folder of the page: `what` says what the files of a pattern are, in the
-        order in which they are shown."""
+        """Links to the files of a run, which lie beside the page: `what` says what those of a pattern are, in the order
+        in which they are shown; then come those that every run writes last."""
         found = [
             (path.relative_to(folder).as_posix(), said)
             for pattern, said in what.items()
             for path in sorted(folder.glob(pattern))
             if path.is_file()
         ]
-        if not found:
-            return
+        found += _OF_EVERY_RUN
         self.heading("Files")
         links = (f'<li><a href="{quote(name)}">{_shown(name)}</a>: {_shown(said)}</li>' for name, said in found)
         self._parts.append(f'<ul class="files">{"".join(links)}</ul>')

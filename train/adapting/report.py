@@ -17,7 +17,6 @@ from .target import Target, light_text
 FILES = {
     "model.safetensors": "the adapted network: --checkpoint takes it",
     "model.md": "its card: what it learned from, and how well it does",
-    "config.yaml": "the settings of this run",
 }
 """What the files of a run are, by pattern."""
 
