@@ -141,12 +141,21 @@ function buffer(gl, target, data) {
   return made;
 }
 
+/* The middle and the largest side of a box around a surface and its cameras, as far as these are not far away. */
+function around(told) {
+  const low = told.vertices.low.slice(), high = low.map((l, k) => l + 65535 * told.vertices.step[k]);
+  const reach = Math.max(...minus(high, low)), least = low.map((l) => l - reach), most = high.map((h) => h + reach);
+  for (const { center } of told.poses) {
+    if (center.some((c, k) => c < least[k] || c > most[k])) continue;
+    center.forEach((c, k) => { [low[k], high[k]] = [Math.min(low[k], c), Math.max(high[k], c)]; });
+  }
+  return [between(low, high, 0.5), Math.max(...minus(high, low)) || 1];
+}
+
 /* What is drawn of one surface, in buffers. */
 class Shown {
   constructor(gl, told) {
-    const range = told.vertices.step.map((step) => 65535 * step);
-    this.middle = told.vertices.low.map((low, k) => low + range[k] / 2);
-    this.extent = Math.max(...range) || 1;
+    [this.middle, this.extent] = around(told);
     this.gl = gl;
     this.told = told;
     const vertices = places(told.vertices, this.middle), triangles = numbers(told.triangles);

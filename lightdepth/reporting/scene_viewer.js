@@ -234,7 +234,7 @@ class Viewer {
     };
     now.clouds.forEach((cloud, i) => clouds[i] && put(cloud.data, cloud.count, gl.POINTS, cloud.color, 4));
     if (path) put(now.path, now.poses.length, gl.LINE_STRIP, PATH, 1);
-    if (cameras) {
+    if (cameras && this.inside === null) { /* inside, they would stand in the way */
       gl.disable(gl.DEPTH_TEST); /* else the wall, around which they are, would hide them */
       put(now.lines[0].data, now.lines[0].count, gl.LINES, USED, 1);
       put(now.lines[1].data, now.lines[1].count, gl.LINES, LEFT_OUT, 1);
@@ -249,7 +249,7 @@ class Viewer {
 
   /* The keyframe whose camera is drawn at a place of the canvas (CSS pixels), -1 if none is within 16. */
   at(x, y) {
-    if (!this.visible[2]) return -1;
+    if (!this.visible[2] || this.inside !== null) return -1;
     const { axes, eye, aspect, tangent, near } = this.camera();
     const [w, h] = [this.canvas.clientWidth / 2, this.canvas.clientHeight / 2];
     let found = -1, closest = 16;
