@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from densify.aligned import AlignedKeyframe
-from densify.coverage import seen_well
 from densify.dense_map import DenseMap
-from densify.evaluation.records import MapFigures
+from densify.evaluation.records import ErrorMesh, MapFigures
 from densify.joining import Merged, joined_name
 from densify.judging.verdict import spoke
 from densify.pipeline import SubmapResult
 from densify.predictions import SeenKeyframe
+from densify.scene import KINDS, SURFACE_FILES, TRUSTED, Thumbnails, scene_of, seen_kinds, surface_of, tangents
 from lightdepth.camera import CameraModel
 from lightdepth.reporting.figures import (
     BAD,
@@ -23,20 +23,18 @@ from lightdepth.reporting.figures import (
     chart,
     chart_png,
     colored_distance,
+    jpeg,
     marked_points,
-    png,
     side_by_side,
     thumbnail,
 )
 from lightdepth.reporting.report import Report, number
+from lightdepth.reporting.scene import Surface
 from lightdepth.sparse_map import SparseMap, Submap
-
-SEEN_WELL, SEEN_WEAKLY, DOUBTFUL = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15), (0.8, 0.15, 0.15)
-_TRUSTED = 0.2  # confidence below which wall is red: it is expected to be off by twice what is doubted
 
 
 class Gallery:
-    """Pictures of a few keyframes of every submap, taken as they pass."""
+    """Pictures of a few keyframes of every submap, taken as they pass, and small ones of more keyframes."""
 
     def __init__(self, sparse_map: SparseMap, per_map: int = 3):
         self._chosen = {
@@ -45,8 +43,10 @@ class Gallery:
             for i in np.linspace(0, len(s.keyframes) - 1, per_map + 2).astype(int)[1:-1]
         }
         self.pictures: dict[int, list[tuple[bytes, str]]] = {s.id: [] for s in sparse_map.submaps}
+        self.thumbnails = Thumbnails(sparse_map)
 
     def __call__(self, submap: Submap, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
+        self.thumbnails(aligned.keyframe.name, seen)
         if (submap.id, aligned.keyframe.number) not in self._chosen or seen.frame is None or seen.prediction is None:
             return
         assert aligned.observed is not None
@@ -65,7 +65,7 @@ class Gallery:
         caption = (
             f"{aligned.keyframe.name}: image, predicted distance (yellow near), map points (green in, red out); {state}"
         )
-        self.pictures[submap.id].append((png(picture), caption))
+        self.pictures[submap.id].append((jpeg(picture), caption))
 
 
 def densify_page(
@@ -75,12 +75,18 @@ def densify_page(
     notes: Sequence[str],
     figures: Sequence[MapFigures] | None = None,
     mm_per_unit: float | None = None,
+    merged: Merged | None = None,
+    errors: Sequence[ErrorMesh] = (),
 ) -> Report:
-    """The whole page. `figures` are their
-    errors where there is truth; areas are in mm² where the unit of the maps is known."""
+    """The whole page. `figures` are their errors where there is truth, and `errors` those of vertices; areas are in mm²
+    where the unit of the maps is known."""
     page = Report(title)
     for note in notes:
         page.text(note)
+    scene = scene_of(_surfaces(results, merged, errors), gallery.thumbnails.found)
+    if scene is not None:
+        page.heading("The surface in three dimensions")
+        page.scene(scene)
     if figures is not None:
         _errors(page, figures)
     page.heading("Surfaces")
@@ -126,6 +132,34 @@ def joined_section(page: Report, merged: Merged) -> None:
         if len(result.dense.triangles):
             for row in mesh_pictures(result.dense, f"maps {maps}"):
                 page.figures(row)
+
+
+def _surfaces(results: Sequence[SubmapResult], merged: Merged | None, errors: Sequence[ErrorMesh]) -> list[Surface]:
+    """The joined surfaces, then those of submaps that are in none of them."""
+    joined = [] if merged is None else list(zip(merged.results, merged.groups, strict=True))
+    joined = [(result, group) for result, group in joined if len(result.dense.triangles)]
+    within = {map_id for _, group in joined for map_id in group}
+    distances = {mesh.name: mesh.distance for mesh in errors}
+    surfaces = [
+        surface_of(f"{joined_name(result)}: maps {', '.join(map(str, sorted(group)))} as one", result.dense)
+        for result, group in joined
+    ]
+    for dense in (r.dense for r in results if r.dense.submap.id not in within):
+        number = dense.submap.id
+        surfaces.append(surface_of(f"map {number}", dense, distances.get(f"map_{number:03d}")))
+    return surfaces
+
+
+FILES = {
+    "joined_*/mesh.*": "the joined surface",
+    **SURFACE_FILES,
+    "*_error.ply": "the surface coloured by its distance from the truth",
+    "metrics.md": "errors against the truth, in tables",
+    "metrics.json": "the same, for programs",
+    "cumulative_error.png": "the share of the surface within each error",
+    "uncertainty.json": "the factor that calibrates the predicted uncertainty",
+}
+"""What the files of a run are, by pattern."""
 
 
 def _errors(page: Report, figures: Sequence[MapFigures]) -> None:
@@ -262,20 +296,16 @@ def mesh_pictures(dense: DenseMap, name: str = "") -> list[list[tuple[bytes, str
         f"From keyframe {middle.name}; white is no surface": inside,
     }
     ways: list[tuple[np.ndarray | None, str]] = [(dense.colors, ""), (None, "Its shape, without its colour")]
-    if dense.weights is not None and dense.confidence is not None:
-        weak = np.where(dense.confidence[:, None] < _TRUSTED, DOUBTFUL, SEEN_WEAKLY)
-        colors = np.where(seen_well(dense)[:, None], SEEN_WELL, weak)
-        ways.append((colors, f"Seen well (green), weakly (orange), or of a confidence below {_TRUSTED} (red)"))
-    return [[(png(view.picture(c)), text or said) for c, text in ways] for said, view in views.items()]
+    if (kinds := seen_kinds(dense)) is not None:
+        ways.append((KINDS[kinds], f"Seen well (green), weakly (orange), or of a confidence below {TRUSTED} (red)"))
+    return [[(jpeg(view.picture(c)), text or said) for c, text in ways] for said, view in views.items()]
 
 
 def _focal_to_see(camera: CameraModel) -> float:
     """The focal length, over the width of a picture of 4 by 3, with which a pinhole shows all that a camera sees, up to
     some 120 degrees."""
-    rays, valid = camera.rays()
-    ahead = rays[valid & (rays[..., 2] > 0.1)]
-    across, down = np.abs(ahead[:, :2] / ahead[:, 2:]).T
-    wanted = 0.5 / max(np.quantile(across, 0.995), 4 / 3 * np.quantile(down, 0.995)) if len(across) else 0.6
+    across, down = tangents(camera)
+    wanted = 0.5 / max(across, 4 / 3 * down)
     return float(np.clip(wanted, 0.28, 1.5))
 
 

@@ -287,10 +287,13 @@ def files(folder: Path) -> set[Path]:
 
 
 def _pictures(page: Path) -> list[str]:
-    """The pictures within a page, but for the one of the time that everything took."""
+    """The pictures and scenes within a page, but for the picture of the time that everything took."""
     times = page.with_name("timings.png")
     passed_over = base64.b64encode(times.read_bytes()).decode() if times.is_file() else ""
-    found = re.findall(r"data:image/[^\"']+", page.read_text())
+    text = page.read_text()
+    found = re.findall(r"data:image/[^\"']+", text) + re.findall(
+        r'<script type="application/json">(.*?)</script>', text
+    )
     return [picture for picture in found if not passed_over or not picture.endswith(passed_over)]
 
 

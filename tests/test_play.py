@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 
 import cv2
@@ -134,7 +135,13 @@ def test_the_verb_writes_surfaces_timings_and_what_they_say(data, tmp_path, caps
     counts = [m["ahead"]["new_points"]["count"] for m in record["maps"]]
     rows = list(csv.DictReader((run / "timings.csv").open()))
     assert sum(counts) == sum(int(r["new_points"]) for r in rows) > 0
-    assert "Agreement with the map ahead" in (run / "report.html").read_text()
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert "Agreement with the map ahead" in page
+    links = re.findall('href="([^"]+)"', page)
+    assert {"map_001/mesh.ply", "run.json"} < set(links) and all((run / link).is_file() for link in links)
+    (scene,) = re.findall(r'<script type="application/json">(.*?)</script>', page)
+    shown = json.loads(scene)["surfaces"]
+    assert [s["title"] for s in shown] == ["map 0", "map 1"] and all(s["triangles_made"] > 100 for s in shown)
 
 
 def test_the_verb_names_lost_frames_and_refuses_settings_that_are_none(data, tmp_path):

@@ -70,13 +70,14 @@ def test_top_level_names_are_the_three_packages(names):
     assert top == {*PACKAGES, info} and info.startswith("lightdepth-")
 
 
-def test_every_module_is_in_the_wheel_and_nothing_else_but_weights_presets_and_marks(names):
+def test_every_module_is_in_the_wheel_and_nothing_else_but_weights_presets_pages_and_marks(names):
     modules = {str(p.relative_to(ROOT)) for package in PACKAGES for p in (ROOT / package).rglob("*.py")}
     weights = {str(p.relative_to(ROOT)) for p in (ROOT / "lightdepth" / "weights").glob("*") if p.is_file()}
     presets = {f"lightdepth/{p.relative_to(ROOT)}" for p in (ROOT / "configs").rglob("*.yaml")}
     marks = {f"{package}/py.typed" for package in PACKAGES}
+    pages = {f"lightdepth/reporting/{name}" for name in ("report.css", "scene_surface.js", "scene_viewer.js")}
     assert len(presets) > 5
-    assert {n for n in names if ".dist-info/" not in n} == modules | weights | presets | marks
+    assert {n for n in names if ".dist-info/" not in n} == modules | weights | presets | pages | marks
 
 
 def test_the_default_checkpoint_is_in_the_wheel(names):

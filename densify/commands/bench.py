@@ -328,7 +328,9 @@ def compare_completions(
             [*(t.markdown() for t in completion_tables(cells)), *(f"{n}\n" for n in completion_notes(cells))]
         )
         (folder.folder / "completion.md").write_text(text, encoding="utf-8", errors="backslashreplace")
-        completion_page(cells, pictures).write(folder.folder / "report.html")
+        page = completion_page(cells, pictures)
+        page.files(folder.folder, {"completion.md": "the tables", "completion.json": "every figure, for programs"})
+        page.write(folder.folder / "report.html")
         folder.log(text)
 
 

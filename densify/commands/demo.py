@@ -12,7 +12,7 @@ from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import dense_models, read_run
 from densify.evaluation.tables import write_evaluations
 from densify.evaluation.truth import read_truth
-from densify.page import densify_page
+from densify.page import FILES, densify_page
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import open_sequence
@@ -90,6 +90,8 @@ def demo(
             work.gallery,
             notes,
             evaluation.judged.maps,
+            errors=evaluation.meshes,
         )
+        page.files(run.folder, FILES)
         page.write(run.folder / "report.html")
         run.log(f"{output}/report.html")

@@ -8,7 +8,7 @@ from densify.config import DensifyConfig
 from densify.densified import Densified
 from densify.inputs import MapSource, SurfaceFiles, doubts_of_inputs, fitted_light, map_and_frames
 from densify.joining import MergeConfig
-from densify.page import densify_page, joined_section
+from densify.page import FILES, densify_page, joined_section
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
@@ -72,8 +72,11 @@ def densify(
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
         notes += [f"Warning: {said}" for said in run.record["warnings"]]
         notes += [f"Map {map_id}: {proposal}." for map_id, proposal in proposals.items()]
-        page = densify_page("Densified maps", work.results, work.gallery, notes, None, files.mm_per_unit)
+        page = densify_page(
+            "Densified maps", work.results, work.gallery, notes, None, files.mm_per_unit, merged=work.merged
+        )
         if work.merged is not None:
             joined_section(page, work.merged)
+        page.files(run.folder, FILES)
         page.write(run.folder / "report.html")
         run.log(f"{output}/report.html")

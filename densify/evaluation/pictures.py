@@ -13,7 +13,8 @@ from lightdepth.reporting.figures import MeshView, chart, chart_png, png, side_b
 
 MODELS = {"sparse": "Sparse map", "sparse_inliers": "Sparse inliers", "dense": "Dense"}
 """The names of the point clouds, for people."""
-_COLOR_MM = 5.0
+FARTHEST_COLOR_MM = 5.0
+"""The error from which on a surface is red."""
 
 
 def curve_picture(evaluation: Evaluation[DepthJudged | MapsJudged]) -> bytes:
@@ -35,7 +36,7 @@ def curve_picture(evaluation: Evaluation[DepthJudged | MapsJudged]) -> bytes:
 
 def error_colors(distance: np.ndarray) -> np.ndarray:
     """(n, 3) in [0, 1]: from blue (0) over green and yellow to red (5 mm and more)."""
-    level = np.rint(255 * (0.08 + 0.87 * np.clip(distance / _COLOR_MM, 0, 1))).astype(np.uint8)
+    level = np.rint(255 * (0.08 + 0.87 * np.clip(distance / FARTHEST_COLOR_MM, 0, 1))).astype(np.uint8)
     return cv2.applyColorMap(level.reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0, ::-1] / 255
 
 
@@ -54,12 +55,12 @@ def error_picture(mesh: ErrorMesh) -> bytes:
     picture = MeshView.of(mesh.vertices, mesh.triangles).picture(error_colors(mesh.distance))
     height, top, bottom = picture.shape[0], 70, 40
     scale = np.full((height, 150, 3), 255, np.uint8)
-    steps = np.linspace(_COLOR_MM, 0, height - top - bottom)
+    steps = np.linspace(FARTHEST_COLOR_MM, 0, height - top - bottom)
     scale[top : height - bottom, 20:44] = np.rint(255 * error_colors(steps))[:, None]
     write = partial(cv2.putText, scale, fontFace=cv2.FONT_HERSHEY_SIMPLEX, color=(60, 60, 60), lineType=cv2.LINE_AA)
     for line, words in enumerate(("distance to the", "closest true point")):
         write(text=words, org=(6, 24 + 18 * line), fontScale=0.42)
-    for mm in range(int(_COLOR_MM) + 1):
-        row = round(height - bottom - mm / _COLOR_MM * (height - top - bottom))
-        write(text=f"{mm:g} mm" + " and more" * (mm == _COLOR_MM), org=(50, row + 5), fontScale=0.42)
+    for mm in range(int(FARTHEST_COLOR_MM) + 1):
+        row = round(height - bottom - mm / FARTHEST_COLOR_MM * (height - top - bottom))
+        write(text=f"{mm:g} mm" + " and more" * (mm == FARTHEST_COLOR_MM), org=(50, row + 5), fontScale=0.42)
     return png(side_by_side([picture, scale]))

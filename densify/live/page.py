@@ -8,16 +8,30 @@ import numpy as np
 
 from densify.judging.ahead import Ahead, running
 from densify.live.play import Played
+from densify.scene import SURFACE_FILES
 from lightdepth.reporting.figures import chart, chart_png
 from lightdepth.reporting.report import Report
+from lightdepth.reporting.scene import Scene
+
+FILES = {
+    **SURFACE_FILES,
+    "timings.csv": "what each keyframe's time went into",
+}
+"""What the files of a run are, by pattern."""
 
 
-def live_page(verdict: str, judged: Mapping[int, Ahead], played: Sequence[Played], timings: bytes) -> Report:
+def live_page(
+    verdict: str, judged: Mapping[int, Ahead], played: Sequence[Played], timings: bytes, scene: Scene | None = None
+) -> Report:
     """The whole page; `verdict` in words and `judged` by map, empty where nothing was, `timings` the picture of them
-    (PNG)."""
+    (PNG), `scene` the finished surfaces."""
     page = Report("Live surfaces")
     if verdict:
         page.text(f"Verdict: {verdict}.")
+    if scene is not None:
+        page.heading("The surface in three dimensions")
+        page.scene(scene)
+    if verdict:
         _agreement(page, judged, played)
     page.heading("Time")
     page.wide_figures([(timings, "What each keyframe's time went into")])

@@ -85,7 +85,7 @@ def play(
 
     With `rate` [keyframes per second] the n-th keyframe is not there before n / rate seconds, and waits while an
     earlier one is worked on; without, each comes when the last is done. The clock stands still while a finished surface
-    is judged by its images. Only one submap is held at a time.
+    is judged by its images and written. Only one submap is held at a time.
     """
     if rate is not None and not rate > 0:
         raise InputError("rate", f"{rate}", "expected keyframes per second, above 0")
@@ -106,9 +106,9 @@ def play(
         if densifier.alignments:
             began = time.perf_counter()
             done = Finished.of(densifier)
-            start += time.perf_counter() - began  # nothing waits for it: the next submap need not
             submap_there = replace(done.dense.submap, origin=submap.origin)
             on_map(replace(done, dense=replace(done.dense, submap=submap_there)))
+            start += time.perf_counter() - began  # nothing waits for it: the next submap need not
     return played
 
 

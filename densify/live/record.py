@@ -10,11 +10,13 @@ from densify.coverage import coverage as coverage_of
 from densify.judging.ahead import Ahead
 from densify.judging.verdict import doubted, headline, worst
 from densify.judging.withheld import Withheld
-from densify.live.page import live_page
+from densify.live.page import FILES, live_page
 from densify.live.play import Finished, Played, time_spent, timings_picture, write_timings
+from densify.scene import TRIANGLES, scene_of, surface_of
 from lightdepth.depth_gate import sentence
 from lightdepth.errors import InputError
 from lightdepth.reporting.run import Run, plain
+from lightdepth.reporting.scene import Surface
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,7 @@ class PlayedRun:
         self._run, self._coverage, self._mm_per_unit, self._judged = run, coverage, mm_per_unit, judged
         self._doubts = doubts
         self._records: list[_MapRecord] = []
+        self._surfaces: list[Surface] = []  # thinned: only one submap is held whole
 
     def add(self, done: Finished) -> None:
         """Writes the surface of a submap whose last keyframe is done; an empty one is a failed part of the run."""
@@ -75,6 +78,7 @@ class PlayedRun:
         if not len(dense.triangles):
             self._run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
             return
+        self._surfaces.append(surface_of(f"map {dense.submap.id}", dense).thinned(TRIANGLES))
         replace(dense, unit="mm" if scale else dense.unit).write(self._run.folder / name, ("ply",), scale)
 
     def finish(self, played: Sequence[Played], model: str, rate: float | None, budget_ms: float) -> None:
@@ -111,7 +115,9 @@ class PlayedRun:
         run.record["doubted"] = doubts = {p.keyframe: p.doubt for p in played if p.doubt}
         if doubts:
             run.log(sentence(doubts, len(played)))
-        live_page(said, judged, played, picture).write(run.folder / "report.html")
+        page = live_page(said, judged, played, picture, scene_of(self._surfaces))
+        page.files(run.folder, FILES)
+        page.write(run.folder / "report.html")
         timings = spent.timings
         assert timings is not None, "a surface has keyframes that were read"
         run.log(

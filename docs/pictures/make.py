@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-FIGURE = re.compile(r'src="data:image/png;base64,([^"]+)"[^>]*><figcaption>([^<]*)')
+FIGURE = re.compile(r'src="data:image/(?:png|jpeg);base64,([^"]+)"[^>]*><figcaption>([^<]*)')
 HERE = Path(__file__).parent
 HEIGHT, GAP = 300, 12
 

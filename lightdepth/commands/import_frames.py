@@ -17,7 +17,7 @@ from lightdepth.command_line.options import Group
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.importing.doubts import doubts, facts
-from lightdepth.importing.page import Picture, import_page
+from lightdepth.importing.page import FILES, Picture, import_page
 from lightdepth.importing.pictures import Geometry, PictureConfig, write_pictures
 from lightdepth.importing.regions import find_regions, read_overlay_mask, tissue_picture
 from lightdepth.importing.scan import scanned, write_measures
@@ -97,8 +97,9 @@ def import_frames(
         page = import_page(
             known, found, scan.measures, fate, axis, pictures, tissue_picture(regions) if frames else None
         )
-        page.write(run.folder / "report.html")
         write_measures(run.folder / "frames.csv", opened, scan, fate)
+        page.files(run.folder, FILES)
+        page.write(run.folder / "report.html")
         run.record["findings"] = [{"found": f.found, "do": f.cure} for f in found]
         run.record["frames"] = {"measured": len(scan.rows), "kept": len(chosen)}
         for each in found:

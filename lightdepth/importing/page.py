@@ -18,6 +18,16 @@ Picture = tuple[np.ndarray, str, bool]
 """A thumbnail (h, w, 3), its label, and whether the frame was kept."""
 
 
+FILES = {
+    "frames.csv": "every frame with its measures, and why it was left out",
+    "camera.json": "the camera",
+    "light.json": "the light",
+    "mask.png": "white where tissue shows",
+    "times.csv": "when each frame was taken",
+}
+"""What the files of a run are, by pattern."""
+
+
 def import_page(
     facts: Sequence[Sequence[Any]],
     findings: Sequence[Finding],

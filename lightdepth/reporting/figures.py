@@ -19,17 +19,29 @@ PLAIN = (0.82, 0.8, 0.78)
 
 def png(image: np.ndarray) -> bytes:
     """PNG of an RGB image (H, W, 3), uint8 or float in [0, 1]."""
-    if image.dtype != np.uint8:
-        image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    done, data = cv2.imencode(".png", cv2.cvtColor(_eight_bits(image), cv2.COLOR_RGB2BGR))
     assert done
     return data.tobytes()
 
 
+def jpeg(image: np.ndarray, quality: int = 88) -> bytes:
+    """JPEG of an RGB image (H, W, 3), uint8 or float in [0, 1]: of an image or a surface, a fifth of the PNG's size."""
+    image = cv2.cvtColor(_eight_bits(image), cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    return data.tobytes()
+
+
+def _eight_bits(image: np.ndarray) -> np.ndarray:
+    if image.dtype == np.uint8:
+        return image
+    found: np.ndarray = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return found
+
+
 def thumbnail(image: np.ndarray, width: int) -> np.ndarray:
     """An RGB image (H, W, 3) at another width, as uint8."""
-    if image.dtype != np.uint8:
-        image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    image = _eight_bits(image)
     height = max(1, round(image.shape[0] * width / image.shape[1]))
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
@@ -45,8 +57,19 @@ def colored_distance(
     log = np.log(np.where(valid, distance, 1))
     low, high = np.log(near_far) if near_far else np.quantile(log[valid], (0.01, 0.99))
     level = 255 * (1 - np.clip((log - low) / max(high - low, 1e-6), 0, 1))
-    colors = cv2.cvtColor(cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+    colors = _viridis(level)
     return np.where(valid[..., None], colors, 0).astype(np.uint8)
+
+
+def _viridis(level: np.ndarray) -> np.ndarray:
+    """RGB uint8 of levels (h, w) from 0, violet, to 255, yellow."""
+    return cv2.cvtColor(cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+
+
+def level_colors(shares: np.ndarray) -> np.ndarray:
+    """Colours (n, 3) in [0, 1] of shares (n,) in [0, 1]: violet low, yellow high."""
+    found: np.ndarray = _viridis(np.rint(255 * np.clip(shares, 0, 1))[:, None])[:, 0] / 255
+    return found
 
 
 def marked_points(
@@ -179,13 +202,7 @@ def _outside(vertices: np.ndarray, u: np.ndarray, v: np.ndarray, aspect: float) 
     sample = vertices[:: max(1, len(vertices) // 20000)]
     middle = sample.mean(0)
     sample = sample - middle
-    axes = np.linalg.svd(sample, full_matrices=False)[2]
-    axes *= np.sign(axes[range(3), np.abs(axes).argmax(1)])[:, None]  # else rounding decides which side is seen
-    long, across, thin = axes
-    forward = thin + 0.45 * across
-    forward /= np.linalg.norm(forward)
-    right = long
-    down = np.cross(forward, right)
+    right, down, forward = outside_axes(vertices)
     place = sample @ np.stack([right, down, forward]).T
     low, high = np.quantile(place, (0.001, 0.999), axis=0)
     middle = middle + (low + high)[:2] / 2 @ np.stack([right, down])
@@ -193,3 +210,14 @@ def _outside(vertices: np.ndarray, u: np.ndarray, v: np.ndarray, aspect: float) 
     behind = 2 * float(np.abs(place[:, 2]).max()) + 0.1  # of a flat mesh too the rays begin before it
     origins = middle + extent * (u[..., None] * right + v[..., None] * down) - behind * forward
     return origins, np.broadcast_to(forward, origins.shape)
+
+
+def outside_axes(vertices: np.ndarray) -> np.ndarray:
+    """Axes (3, 3; rows right, down, forward) of a look at the broad side of vertices (n, 3), a little from above."""
+    sample = vertices[:: max(1, len(vertices) // 20000)]
+    axes = np.linalg.svd(sample - sample.mean(0), full_matrices=False)[2]
+    axes *= np.sign(axes[range(3), np.abs(axes).argmax(1)])[:, None]  # else rounding decides which side is seen
+    long, across, thin = axes
+    forward = thin + 0.45 * across
+    forward /= np.linalg.norm(forward)
+    return np.stack([long, np.cross(forward, long), forward])

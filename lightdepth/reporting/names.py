@@ -105,15 +105,21 @@ class Names:
         """Some lines at a time: the points of a sparse map may be a file of hundreds of megabytes."""
         made, changed = path.with_name(f"{PARTIAL}{path.name}"[:250]), False
         with path.open("rb") as old, made.open("wb") as new:
-            while lines := b"".join(old.readlines(1 << 24)):
+            page = path.suffix == ".html"  # one that is parted by lines may be parted within its program
+            while lines := old.read() if page else b"".join(old.readlines(1 << 24)):
                 before = lines.decode("utf-8", "surrogateescape")
-                after = self.text(before)
+                after = self._page(before) if page else self.text(before)
                 changed |= after != before
                 new.write(after.encode("utf-8", "surrogateescape"))
         if changed:
             os.replace(made, path)
         else:
             made.unlink()
+
+    def _page(self, text: str) -> str:
+        """As `text`, but for the style and the program of a page: they hold no name, and a word changed breaks them."""
+        parts = re.split(r"(<style>.*?</style>|<script>.*?</script>)", text, flags=re.DOTALL)
+        return "".join(part if i % 2 else self.text(part) for i, part in enumerate(parts))
 
     @cached_property
     def _forms(self) -> dict[str, str]:

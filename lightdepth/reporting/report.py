@@ -1,35 +1,44 @@
-"""One offline HTML file: headings, sentences, tables and pictures, with nothing loaded from anywhere."""
+"""One offline HTML file: headings, sentences, tables, pictures and scenes, with nothing loaded from anywhere.
+
+report.css and scene_*.js, beside this module, go into the page.
+"""
 
 from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from lightdepth.foreign_text import for_terminal
+from lightdepth.reporting.scene import Scene
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd; }
-table { border-collapse: collapse; margin: .8rem 0; } th, td { padding: .25rem .8rem; text-align: right; }
-th { border-bottom: 2px solid #888; font-weight: 600; } td { border-bottom: 1px solid #e5e5e5; }
-th:first-child, td:first-child { text-align: left; } td.text, th.text { text-align: left; }
-figure { margin: 1rem 0; } figure img { max-width: 100%; } figcaption { color: #555; font-size: .9rem; }
-h1, h2, p, figcaption { overflow-wrap: anywhere; }  td.text { overflow-wrap: anywhere; min-width: 5rem; }
-.figures { display: flex; flex-wrap: wrap; gap: 1rem; } .figures figure { margin: 0; flex: 1 1 300px; }
-"""
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; base-uri 'none'"
+"""What a browser is told to refuse: all that does not stand in the page."""
+
+_VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
+_JPEG = b"\xff\xd8"
+_OF_EVERY_RUN = [
+    ("config.yaml", "the settings of this run"),
+    ("log.txt", "what it said"),
+    ("run.json", "what was done, with figures, versions and warnings"),
+]
+_OPENERS = "MeshLab, CloudCompare and Blender"
 
 
 class Report:
     """Collects the parts of a page in order."""
 
     def __init__(self, title: str):
-        self._title = title
+        self._title, self._heading, self._drawn = title, title, False
         self._parts = [f"<h1>{_shown(title)}</h1>"]
 
     def heading(self, text: str) -> None:
+        self._heading = text
         self._parts.append(f"<h2>{_shown(text)}</h2>")
 
     def text(self, text: str) -> None:
@@ -38,26 +47,74 @@ class Report:
     def table(self, headers: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Numbers are shown with three significant digits; give strings where that is not wanted."""
         of_words = [bool(rows) and isinstance(rows[0][i], str) for i in range(len(headers))]
-        classes = [' class="text"' if words else "" for words in of_words]
-        head = "".join(f"<th{c}>{_shown(h)}</th>" for h, c in zip(headers, classes, strict=True))
+        head = "".join(map(_header, headers, of_words))
         body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
-        self._parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+        name = f"Table: {_shown(self._heading)}"  # one that is wider than a phone is scrolled in a box, by keys too
+        self._parts.append(
+            f'<div class="table" role="group" tabindex="0" aria-label="{name}">'
+            f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+        )
+
+    def files(self, folder: Path, what: Mapping[str, str]) -> None:
+        """Links to the files of a run, which lie beside the page: `what` says what those of a pattern are, in the order
+        in which they are shown; then come those that every run writes last."""
+        found = [
+            (path.relative_to(folder).as_posix(), said)
+            for pattern, said in what.items()
+            for path in sorted(folder.glob(pattern))
+            if path.is_file()
+        ]
+        found += _OF_EVERY_RUN
+        self.heading("Files")
+        links = (f'<li><a href="{quote(name)}">{_shown(name)}</a>: {_shown(said)}</li>' for name, said in found)
+        self._parts.append(f'<ul class="files">{"".join(links)}</ul>')
+        if any(name.endswith((".ply", ".obj", ".glb", ".stl")) for name, _ in found):
+            self.text(f"Open surfaces and points with {_OPENERS}.")
+
+    def scene(self, scene: Scene) -> None:
+        """A scene that turns; a still picture where a browser cannot draw it."""
+        still = _figure(scene.still, "The surface from outside, a still picture").replace("<figure", _STILL, 1)
+        said = "Without JavaScript there is a still picture here, and no scene that turns."
+        self._parts.append(
+            f'<div class="scene">{still}<noscript><p>{said}</p></noscript>'
+            f'<script type="application/json">{scene.text()}</script></div>'
+        )
+        self._drawn = True
 
     def figures(self, pictures: Sequence[tuple[bytes, str]]) -> None:
-        """PNG pictures with captions, beside each other where there is room."""
+        """Pictures (PNG or JPEG) with captions, beside each other where there is room."""
         self._parts.append('<div class="figures">' + "".join(_figure(*p) for p in pictures) + "</div>")
 
     def wide_figures(self, pictures: Sequence[tuple[bytes, str]]) -> None:
-        """PNG pictures with captions, one below the other."""
+        """Pictures (PNG or JPEG) with captions, one below the other."""
         self._parts += [_figure(*p) for p in pictures]
 
     def write(self, path: Path) -> None:
-        head = f'<meta charset="utf-8"><title>{_shown(self._title)}</title><style>{_STYLE}</style>'
+        head = (
+            f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_POLICY}">{_VIEWPORT}'
+            f"<title>{_shown(self._title)}</title><style>{_beside('report.css')}</style>"
+        )
+        drawing = f"<script>{_drawing()}</script>" if self._drawn else ""
         path.write_text(
-            f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(self._parts)}</body></html>\n",
+            f'<!doctype html><html lang="en"><head>{head}</head>'
+            f"<body><main>{''.join(self._parts)}</main>{drawing}</body></html>\n",
             encoding="utf-8",
             errors="backslashreplace",  # names that are not UTF-8
         )
+
+
+_STILL = '<figure class="scene-still"'
+
+
+@cache
+def _beside(name: str) -> str:
+    """A text that is installed beside this module."""
+    return package_files("lightdepth.reporting").joinpath(name).read_text(encoding="utf-8")
+
+
+def _drawing() -> str:
+    """What draws scenes, as one strict function."""
+    return f'(() => {{\n"use strict";\n{_beside("scene_surface.js")}\n{_beside("scene_viewer.js")}}})();'
 
 
 def _shown(text: str) -> str:
@@ -66,9 +123,14 @@ def _shown(text: str) -> str:
 
 
 def _figure(data: bytes, caption: str) -> str:
-    source = base64.b64encode(data).decode()
+    source, kind = base64.b64encode(data).decode(), "jpeg" if data.startswith(_JPEG) else "png"
     text = _shown(caption)
-    return f'<figure><img alt="{text}" src="data:image/png;base64,{source}"><figcaption>{text}</figcaption></figure>'
+    return f'<figure><img alt="{text}" src="data:image/{kind};base64,{source}"><figcaption>{text}</figcaption></figure>'
+
+
+def _header(text: str, of_words: bool) -> str:
+    kind = ' class="text"' if of_words else ""
+    return f'<th scope="col"{kind}>{_shown(text)}</th>' if text else f"<td{kind}></td>"
 
 
 def _cell(value: Any) -> str:

@@ -7,12 +7,18 @@ from collections.abc import Sequence
 from lightdepth.frame import Frame, readable
 from lightdepth.models import DeclineModel, DepthModel, NetworkModel
 from lightdepth.prediction import DepthPrediction
-from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
+from lightdepth.reporting.figures import colored_distance, jpeg, side_by_side, thumbnail
 from lightdepth.reporting.report import Report
 
 from .judging import Outcome
 from .module import Adaptation
 from .target import Target, light_text
+
+FILES = {
+    "model.safetensors": "the adapted network: --checkpoint takes it",
+    "model.md": "its card: what it learned from, and how well it does",
+}
+"""What the files of a run are, by pattern."""
 
 _SHOWN = 4
 
@@ -44,7 +50,7 @@ def _picture(frame: Frame, predictions: Sequence[DepthPrediction]) -> tuple[byte
         maps.append((frame.true_distance, frame.valid & (frame.true_distance > 0)))
         names += ", truth"
     pictures = [thumbnail(picture, 240) for picture in (frame.image, *(colored_distance(*m) for m in maps))]
-    return png(side_by_side(pictures)), f"{frame.name}: {names}"
+    return jpeg(side_by_side(pictures)), f"{frame.name}: {names}"
 
 
 def page(

@@ -30,7 +30,7 @@ from ..adapting.card import AdaptedCard, target_loss
 from ..adapting.config import AdaptConfig
 from ..adapting.judging import Judgement, Outcome, judged, looked_at, verdict
 from ..adapting.module import Adaptation, merge_low_rank
-from ..adapting.report import Pictures, page
+from ..adapting.report import FILES, Pictures, page
 from ..adapting.target import Target, adaptation, frame_data, read_target, replayed_frames
 from ..adapting.wall_judge import compared, wall_judge
 from ..callbacks import Diagnosis, DiagnosisConfig, TrainingProgress
@@ -130,6 +130,7 @@ def adapt(
         light = run.record.get("light_fit")
         made = page(target, start, module, outcome, data.counts["val"], light["summary"] if light else None)
         made.wide_figures(pictures.rows())
+        made.files(run.folder, FILES)
         made.write(run.folder / "report.html")
         _record(run, start, target, module, data, config, outcome)
 

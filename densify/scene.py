@@ -1,0 +1,135 @@
+"""What a dense map shows in three dimensions: its surface, the points that it rests on, and its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+import numpy as np
+
+from densify.coverage import seen_well
+from densify.dense_map import GREEN, GREY, RED, DenseMap
+from densify.evaluation.pictures import FARTHEST_COLOR_MM, error_colors
+from densify.predictions import SeenKeyframe
+from lightdepth.camera import CameraModel
+from lightdepth.reporting.figures import PLAIN, MeshView, colored_distance, jpeg, level_colors, outside_axes, thumbnail
+from lightdepth.reporting.scene import Cloud, Layer, Picture, Pose, Scene, Surface
+from lightdepth.sparse_map import SparseMap
+
+SEEN_WELL, SEEN_WEAKLY, DOUBTFUL = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15), (0.8, 0.15, 0.15)
+TRUSTED = 0.2
+"""Confidence below which wall is red: it is expected to be off by twice what is doubted."""
+
+SURFACE_FILES = {
+    "map_*/mesh.*": "the surface",
+    "*/cloud.ply": "its vertices alone",
+    "*/sparse.ply": "the points of the map, green used, red found wrong",
+    "*/keyframes.csv": "scale, inliers and reasons for each keyframe",
+    "*/trajectory.tum": "the path of the camera",
+    "*/camera.json": "the camera",
+}
+"""What the files of a surface are, by pattern."""
+
+PICTURES = 24
+"""The most keyframes whose pictures a scene has."""
+_WIDTH = 240  # of such a picture
+TRIANGLES = Scene.most
+"""The most triangles that are shown of a surface."""
+_TOGETHER = 250_000  # triangles of all surfaces
+_FEWEST = 4_000  # of each, however many there are
+
+
+class Thumbnails:
+    """Pictures of some keyframes, spread over all submaps, taken as they pass; `found` has them by keyframe."""
+
+    def __init__(self, sparse_map: SparseMap, most: int = PICTURES):
+        names = list(dict.fromkeys(k.name for s in sparse_map.submaps for k in s.keyframes))
+        rows = np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int)
+        self._chosen = {names[i] for i in rows}
+        self.found: dict[str, Picture] = {}
+
+    def __call__(self, name: str, seen: SeenKeyframe) -> None:
+        if name not in self._chosen or name in self.found or seen.frame is None or seen.prediction is None:
+            return
+        depth = colored_distance(seen.prediction.distance, seen.prediction.valid)
+        self.found[name] = Picture(*(jpeg(thumbnail(each, _WIDTH), 80) for each in (seen.frame.image, depth)))
+
+
+def scene_of(surfaces: Sequence[Surface], pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene | None:
+    """The surfaces that have a triangle, the first of them in a still picture too; None where there is none. Many are
+    shown with fewer triangles each."""
+    shown = tuple(surface for surface in surfaces if len(surface.triangles))
+    if not shown:
+        return None
+    still = MeshView.of(shown[0].vertices, shown[0].triangles).picture(shown[0].layers[0].colors())
+    return Scene(shown, jpeg(still), pictures, max(min(TRIANGLES, _TOGETHER // len(shown)), _FEWEST))
+
+
+def surface_of(title: str, dense: DenseMap, distance: np.ndarray | None = None) -> Surface:
+    """All that is shown of a dense map. `distance` (n,) [mm] is that of its vertices from the truth, where there is
+    any."""
+    judged, inlier = dense.judged_points()
+    points = dense.submap.points
+    clouds = (
+        Cloud("Points used", points[judged & inlier], GREEN),
+        Cloud("Points found wrong", points[judged & ~inlier], RED),
+        Cloud("Points not judged", points[~judged], GREY),
+    )
+    keyframes = dense.submap.keyframes
+    return Surface(
+        title,
+        dense.vertices,
+        dense.triangles,
+        _layers(dense, distance),
+        tuple(cloud for cloud in clouds if len(cloud.points)),
+        tuple(Pose(k.name, k.cam_from_map, a.ok) for k, a in zip(keyframes, dense.alignments, strict=True)),
+        tangents(keyframes[len(keyframes) // 2].camera),
+        outside_axes(dense.vertices) if len(dense.vertices) else np.eye(3),
+    )
+
+
+def _layers(dense: DenseMap, distance: np.ndarray | None) -> tuple[Layer, ...]:
+    """Colours, shape, and as far as they are known: confidence, how well it was seen, and error."""
+    layers = [
+        Layer("Of the images", _bytes(dense.colors)),
+        Layer("Shape alone", None, _bytes(np.array([PLAIN]))),
+    ]
+    shades = np.linspace(0, 1, 256)
+    if dense.confidence is not None:
+        marks = ((0.0, "confidence 0"), (0.5, "0.5"), (1.0, "1"))
+        layers.append(Layer("Confidence", _bytes(dense.confidence), _bytes(level_colors(shades)), marks))
+    if (kinds := seen_kinds(dense)) is not None:
+        marks = ((0.0, "seen well"), (0.5, "seen weakly"), (1.0, f"confidence below {TRUSTED}"))
+        layers.append(Layer("How well seen", kinds, _bytes(KINDS), marks))
+    if distance is not None and len(distance) == len(dense.vertices):
+        far = FARTHEST_COLOR_MM
+        marks = ((0.0, "off by 0 mm"), (0.5, f"{far / 2:g} mm"), (1.0, f"{far:g} mm and more"))
+        layers.append(Layer("Error", _bytes(distance / far), _bytes(error_colors(far * shades)), marks))
+    return tuple(layers)
+
+
+def _bytes(shares: np.ndarray) -> np.ndarray:
+    found: np.ndarray = np.rint(255 * np.clip(shares, 0, 1)).astype(np.uint8)
+    return found
+
+
+KINDS = np.array([SEEN_WELL, SEEN_WEAKLY, DOUBTFUL])
+"""The colours of `seen_kinds`."""
+
+
+def seen_kinds(dense: DenseMap) -> np.ndarray | None:
+    """How well each vertex (n,) was seen: 0 well, 1 weakly, 2 weakly and with little confidence."""
+    if dense.weights is None or dense.confidence is None:
+        return None
+    kinds: np.ndarray = np.where(seen_well(dense), 0, np.where(dense.confidence < TRUSTED, 2, 1)).astype(np.uint8)
+    return kinds
+
+
+def tangents(camera: CameraModel) -> tuple[float, float]:
+    """Tangents of half of what a camera sees, across and down, as far as it is ahead."""
+    rays, valid = camera.rays()
+    ahead = rays[valid & (rays[..., 2] > 0.1)]
+    if not len(ahead):
+        return 1.0, 0.75
+    across, down = np.quantile(np.abs(ahead[:, :2] / ahead[:, 2:]), 0.995, axis=0)
+    return float(across), float(down)
