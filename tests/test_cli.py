@@ -182,7 +182,7 @@ def test_evaluate_writes_the_tables_into_the_run_and_again_without_asking(run, d
         assert (run / "evaluation" / name).is_file()
     lines = [line for line in shown.splitlines() if line.startswith("| ")]
     assert [line.split("|")[1].strip() for line in lines[2:5]] == ["map 0", "map 1", "all"] and len(lines) < 15
-    assert shown.splitlines()[-1] == f"every figure: {run}/evaluation/metrics.md"
+    assert shown.splitlines()[-1] == f"written: {run}/evaluation; open {run}/evaluation/metrics.md"
     rows = json.loads((run / "evaluation" / "metrics.json").read_text())["maps"]
     assert all(row["sparse"]["rms_mm"] > 5 * row["dense"]["rms_mm"] for row in rows)
     assert lightdepth("evaluate", run, "--truth", data) == 0

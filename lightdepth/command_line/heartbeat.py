@@ -1,11 +1,13 @@
 """A verb that is at work is never silent for longer than ten seconds: where nothing else was said, what it is at is.
 
 Steps that are counted say how many are done and how long the rest takes (`reporting.progress`), but only when one ends;
-others are not counted at all. So a thread looks now and then when something was said last.
+others are not counted at all. So a thread looks now and then when something was said last. Where LIGHTDEPTH_HEARTBEAT
+is `off` in the environment, it does not.
 """
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -66,6 +68,9 @@ class Heartbeat:
 @contextmanager
 def beating(heart: Heartbeat) -> Iterator[None]:
     """Within it the heart looks every half a second, on a thread of its own."""
+    if os.environ.get("LIGHTDEPTH_HEARTBEAT") == "off":
+        yield
+        return
     over = threading.Event()
 
     def look() -> None:
