@@ -74,6 +74,16 @@ def test_a_step_that_takes_long_is_told_with_rate_and_time_left(clock, capsys):
     )
 
 
+def test_a_line_that_ends_a_silence_is_not_said_twice(clock, capsys):
+    verb = Verb(clock)
+    with Progress("Matching", 100) as bar:
+        for _ in range(80):
+            verb.works(0.5)
+            bar.advance()
+    assert len(verb.lines) == 4 and "at the next" not in verb.lines[0]
+    assert capsys.readouterr().err.splitlines() == ["Matching: 80 in 40.0 s"]
+
+
 def test_stages_are_counted_one_after_the_other(clock, capsys):
     with Stages("sparse map") as told:
         for stage, count in (("features", 40), ("matches", 400)):

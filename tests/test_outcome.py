@@ -115,7 +115,8 @@ def test_a_run_that_is_stopped_says_so_and_names_no_files(tmp_path, capfd):
         in_a_run(tmp_path / "out", Outcome(json=True, verb="predict"), Interrupted(signal.SIGTERM))
     found = json.loads(capfd.readouterr().out)
     assert found["exit_code"] == 128 + signal.SIGTERM and found["files"] == [] and found["result"] is None
-    assert "stopped by SIGTERM" in found["error"]["found"] and set(found["warnings"]) == {"from afar", "from the run"}
+    assert found["error"]["found"] == "stopped by SIGTERM" and "begins anew" in found["error"]["cure"]
+    assert set(found["warnings"]) == {"from afar", "from the run"}
 
 
 def test_a_part_that_failed_is_in_the_document_of_what_was_written(tmp_path, capfd):
@@ -169,6 +170,9 @@ def test_quiet_leaves_errors_and_the_answers_of_verbs_that_write_nothing(camera,
     assert call("convert-camera", camera, "-o", tmp_path / "a.json", "--quiet") == 0
     said = capfd.readouterr()
     assert (said.out, said.err) == (f"written: {tmp_path / 'a.json'}\n", "")
+    assert call("convert-camera", camera, "-o", tmp_path / "b.json", "--quiet", "--json") == 0
+    said = capfd.readouterr()
+    assert json.loads(said.out)["output"] == str(tmp_path / "b.json") and said.err == ""
     assert call("convert-camera", camera, "-o", tmp_path / "a.json", "--quiet") == 3
     said = capfd.readouterr()
     assert said.out == "" and "already there" in said.err and len(said.err.splitlines()) == 1

@@ -115,7 +115,7 @@ def test_an_empty_folder_is_filled_and_a_file_is_no_folder(tmp_path):
 
 def test_part_of_the_work_may_fail_and_the_rest_is_written(tmp_path):
     with (
-        pytest.raises(PartialFailure, match=r"2 part\(s\) failed, the first: 7: truncated\. The rest is in .*out"),
+        pytest.raises(PartialFailure, match=r"2 parts failed, the first: 7: truncated\. The rest is in .*out"),
         run_folder(tmp_path / "out", "predict", {}) as run,
     ):
         run.fail("7", "truncated")

@@ -173,7 +173,8 @@ def speaking(call: Outcome) -> Iterator[list[int]]:
         raise
     except Interrupted as error:
         code[:] = [128 + error.signal]
-        call.fail(call.verb, error, error.kept)
+        stopped, _, kept = str(error).partition("; ")
+        call.fail(call.verb, stopped, kept)
         raise
     except BaseException as error:
         call.fail(call.verb, f"{type(error).__name__}: {error}", "this is a fault of the program: please report it")
@@ -224,7 +225,7 @@ def _streams(call: Outcome) -> Iterator[None]:
             ending.callback(os.close, number)
             ending.callback(os.dup2, number, 1)
             sys.stdout = sys.stderr
-        else:
+        if call.quiet:
             sys.stdout = ending.enter_context(open(os.devnull, "w", encoding="utf-8"))
         try:
             yield

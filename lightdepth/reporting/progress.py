@@ -75,10 +75,12 @@ class Progress:
             print(line, file=self._err, flush=True)
 
     def _state(self, now: float) -> str:
-        """For a silence: the step that takes so long."""
+        """For a silence: the step that takes so long. The next line of its own has time from then on."""
         if self._bar is not None or self._hidden:
             return ""
-        at_it = f", {duration(now - self._since)} at the next" if self.done < self.total else ""
+        self._last = now
+        long = self.done < self.total and now - self._since >= 1
+        at_it = f", {duration(now - self._since)} at the next" if long else ""
         return f"{self.label}: {self.done}/{self.total}{at_it}{self._left()}"
 
     def _left(self) -> str:
