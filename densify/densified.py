@@ -18,6 +18,7 @@ from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify_or_empty
 from densify.predictions import SeenKeyframe
 from densify.resuming import kept_result
+from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence
 from lightdepth.depth_gate import sentence
 from lightdepth.errors import InputError
@@ -56,7 +57,7 @@ class Densified:
         gallery = Gallery(sparse_map)
         count = sum(len(s.keyframes) for s in sparse_map.submaps)
         if run is not None:
-            run.log(f"surfaces: {count} keyframes are aligned together, then fused one by one")
+            run.log(f"surfaces: {counted(count, 'keyframe')} to be aligned together, then fused one by one")
         with Progress("Densifying", count) as bar:
 
             def show(submap: Submap, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
@@ -188,7 +189,7 @@ class Densified:
                     run.log(f"{name}: {result.verdict}")
             if result.coverage is not None:
                 holes = len(result.coverage.holes)
-                text += f"; {result.coverage.well_share:.0%} of the wall seen well, {holes} hole{'s' * (holes != 1)}"
+                text += f"; {result.coverage.well_share:.0%} of the wall seen well, {counted(holes, 'hole')}"
             if dense.unsure_share is not None:
                 text += f"; {unsure(dense.unsure_share, self.config)}"
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")

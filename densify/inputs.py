@@ -26,8 +26,9 @@ from lightdepth.maps.convention import MapReading
 from lightdepth.models import ConstantModel, DepthModel
 from lightdepth.ranges import above, checked
 from lightdepth.reporting.kept import kept
+from lightdepth.reporting.progress import Stages
 from lightdepth.reporting.run import Run, plain
-from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.config import Progress, SfmConfig
 from lightdepth.sfm.keeping import KeptDatabase
 from lightdepth.sfm.made import made_sparse
 from lightdepth.sfm.repair import Repair, repaired_submap
@@ -130,8 +131,9 @@ def repaired(run: Run, sparse_map: SparseMap, frames: FrameSequence, config: Sfm
         images = FrameSequence([k.name for k in seen], _ImagesOf(frames, seen), frames.source) if seen else []
         run.log(f"repair of map {submap.id}: {len(seen)} keyframes are matched")
         folder, database = run.folder / "sparse" / str(submap.id), KeptDatabase(run, f"matching {submap.id}")
-        make = partial(_Repaired.of, submap, images, folder, config, database)
-        new, repair = kept(run, f"repair {submap.id}", _Repaired, make, folder=folder).both
+        with Stages(f"repair of map {submap.id}") as told_of:
+            make = partial(_Repaired.of, submap, images, folder, config, told_of, database)
+            new, repair = kept(run, f"repair {submap.id}", _Repaired, make, folder=folder).both
         worse = repair.left or len(new.keyframes) < len(seen)
         (run.warn if worse else run.log)(f"repair: {repair}")
         submaps.append(with_provenance(new, submap.keyframes[0].camera.provenance))
@@ -151,9 +153,15 @@ class _Repaired:
 
     @classmethod
     def of(
-        cls, submap: Submap, images: Sequence[Frame], folder: Path, config: SfmConfig, database: KeptDatabase
+        cls,
+        submap: Submap,
+        images: Sequence[Frame],
+        folder: Path,
+        config: SfmConfig,
+        progress: Progress,
+        database: KeptDatabase,
     ) -> _Repaired:
-        return cls(*repaired_submap(submap, images, folder, config, None, database))
+        return cls(*repaired_submap(submap, images, folder, config, progress, database))
 
     @property
     def both(self) -> tuple[Submap, Repair]:

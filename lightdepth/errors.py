@@ -37,6 +37,19 @@ class MissingOption(InputError):
     """An option that has to be given and was not: wrong usage. Exit code 2."""
 
 
+class WrongUsage(SystemExit):
+    """Wrong words on the command line, of which a line has told. Exit code 2."""
+
+    found: str
+    """What is wrong with them."""
+    cure: str
+    """Where to read on, or empty."""
+
+    def __init__(self, found: str, cure: str = "") -> None:
+        super().__init__(2)
+        self.found, self.cure = found, cure
+
+
 class PartialFailure(RuntimeError):
     """Part of the work failed; the rest was done and written. Exit code 4; `run.json` says what failed."""
 
@@ -54,7 +67,8 @@ class Interrupted(BaseException):
         self.signal, self.kept = self.args
 
     def __str__(self) -> str:
-        return f"stopped by {signal.Signals(self.signal).name}; {self.kept or 'nothing half-written is left'}"
+        kept = self.kept or "nothing half-written is left; the same command begins anew"
+        return f"stopped by {signal.Signals(self.signal).name}; {kept}"
 
 
 class MachineFailure(RuntimeError):

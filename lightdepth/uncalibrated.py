@@ -23,6 +23,7 @@ from lightdepth.datasets.reading import size_of_frames
 from lightdepth.errors import InputError
 from lightdepth.files.working import working_folder
 from lightdepth.frame import readable
+from lightdepth.reporting.progress import Stages
 from lightdepth.reporting.run import Run
 from lightdepth.sfm.config import SfmConfig
 from lightdepth.sfm.self_calibration import SelfCalibration, across, self_calibrated
@@ -128,7 +129,8 @@ def _found(frames: FrameSequence, fov: float | None, run: Run, config: SfmConfig
         tried.append(rows)
         run.log(f"camera: {len(rows)} frames from {frames.names[rows[0]]} to {frames.names[rows[-1]]} are mapped")
         try:
-            seen.append(self_calibrated(frames.at(rows), config, fov=fov))
+            with Stages("camera") as told_of:
+                seen.append(self_calibrated(frames.at(rows), config, told_of, fov))
         except InputError as error:
             failed = failed or error
             continue

@@ -7,6 +7,7 @@ import torch
 from docstring_parser import attrdoc
 
 torch.set_num_threads(1)
+os.environ["LIGHTDEPTH_HEARTBEAT"] = "off"  # on a busy machine it has more to say
 
 # Each run of a verb in this process reads the sentences of its options from the sources anew; once is enough here.
 _read = functools.cache(functools.partial(attrdoc.AttributeDocstrings.get_attr_docs, attrdoc.AttributeDocstrings()))

@@ -225,7 +225,7 @@ def run_limited(command: Command, here: Path) -> dict[str, object]:
 if __name__ == "__main__":
     from importlib import metadata
 
-    from lightdepth.cli import GROUP, verb_parser
+    from lightdepth.command_line.verbs import GROUP, verb_parser
 
     for verb in sorted({row.typed.split()[0] for row in ROWS}):  # so that each process need not
         (entry,) = metadata.entry_points(group=GROUP, name=verb)

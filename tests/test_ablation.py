@@ -163,7 +163,7 @@ def test_a_row_that_fails_is_in_the_table_and_the_others_are_done(tmp_path, chea
         return untrained(model, *rest, **options)
 
     monkeypatch.setattr(ablation, "fit", failing)
-    with pytest.raises(PartialFailure, match="1 trainings failed, the first: no smoothness: it went nowhere"):
+    with pytest.raises(PartialFailure, match="1 training failed, the first: no smoothness: it went nowhere"):
         run(tmp_path / "run")
     text = (tmp_path / "run" / "ablation.md").read_text()
     assert "- no smoothness, seed 3: it went nowhere" in text and "| ours |" in text

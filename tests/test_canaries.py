@@ -13,7 +13,8 @@ from raising import refused, warned
 
 from densify.exporting.colmap import stem
 from lightdepth import plain_yaml
-from lightdepth.cli import GROUP, main, verb_parser
+from lightdepth.cli import main
+from lightdepth.command_line.verbs import GROUP, verb_parser
 from lightdepth.datasets.catalogue import inside
 from lightdepth.datasets.splits import located
 from lightdepth.reporting.report import Report

@@ -71,6 +71,7 @@ def test_help_lists_the_verbs_in_the_order_of_the_work_each_with_its_line(capsys
         "bench",
         "measure",
         "export",
+        "completion",
     ]
     assert all(len(line.split()) > 4 for line in lines if line.startswith("  "))
     assert lightdepth() == 2
@@ -181,7 +182,7 @@ def test_evaluate_writes_the_tables_into_the_run_and_again_without_asking(run, d
         assert (run / "evaluation" / name).is_file()
     lines = [line for line in shown.splitlines() if line.startswith("| ")]
     assert [line.split("|")[1].strip() for line in lines[2:5]] == ["map 0", "map 1", "all"] and len(lines) < 15
-    assert shown.splitlines()[-1] == f"every figure: {run}/evaluation/metrics.md"
+    assert shown.splitlines()[-1] == f"written: {run}/evaluation; open {run}/evaluation/metrics.md"
     rows = json.loads((run / "evaluation" / "metrics.json").read_text())["maps"]
     assert all(row["sparse"]["rms_mm"] > 5 * row["dense"]["rms_mm"] for row in rows)
     assert lightdepth("evaluate", run, "--truth", data) == 0
@@ -405,7 +406,7 @@ def test_a_broken_frame_among_good_ones_is_4_and_the_rest_is_written(frames, dat
     image = tmp_path / "seq" / "frames" / "000003.png"
     image.write_bytes(image.read_bytes()[:300])
     assert lightdepth("predict", tmp_path / "seq", "--checkpoint", "decline", "-o", tmp_path / "p") == 4
-    assert "1 part(s) failed, the first: 000003: " in capsys.readouterr().err
+    assert "1 part failed, the first: 000003: " in capsys.readouterr().err
     assert len(list((tmp_path / "p").glob("*.npz"))) == 7 and not (tmp_path / "p" / "000003.npz").exists()
     (failure,) = json.loads((tmp_path / "p" / "run.json").read_text())["failures"]
     assert failure["what"] == "000003" and "not a readable image" in failure["reason"]
@@ -438,7 +439,7 @@ def test_a_map_that_no_keyframe_fits_is_4_and_the_other_is_written(frames, data,
     points.write_text("\n".join(kept) + "\n")
     argv = ["--map", tmp_path / "slam", "--checkpoint", "decline", "--judge.on", "false"]
     assert lightdepth("densify", frames, *argv, "-o", tmp_path / "out") == 4
-    assert "2 part(s) failed, the first: map_001: " in capsys.readouterr().err
+    assert "2 parts failed, the first: map_001: " in capsys.readouterr().err
     assert "map_000" in left_in(tmp_path / "out") and "map_001" not in left_in(tmp_path / "out")
     assert "report.html" in left_in(tmp_path / "out")
 

@@ -253,7 +253,8 @@ def test_without_its_map_and_frames_a_run_is_still_exported_and_what_is_missing_
     assert main(["export", str(run), "-o", str(tmp_path / "out"), "--to", "colmap"]) == 0
     said = capsys.readouterr().out
     assert "no tracks" in said and "frames are not found" in said
-    assert "map_000/ has dense/, sparse/: 8 keyframes, " in said and said.endswith(f"in mm\n{tmp_path / 'out'}\n")
+    assert "map_000/ has dense/, sparse/: 8 keyframes, " in said and "in mm\nnext: colmap " in said
+    assert said.endswith(f"written: {tmp_path / 'out'}\n")
     rebuilt = native.pycolmap().Reconstruction(tmp_path / "out" / "map_000" / "sparse" / "0")
     assert len(rebuilt.images) == 8 and all(p.track.length() == 0 for p in rebuilt.points3D.values())
     (run / "data").mkdir()

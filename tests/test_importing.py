@@ -13,7 +13,8 @@ from verbs import by_options
 from videos import CAMERA, OCTAGON, picture, uneven_times, write_video
 
 from lightdepth.calibration import write_camera
-from lightdepth.cli import main, verb_parser
+from lightdepth.cli import main
+from lightdepth.command_line.verbs import verb_parser
 from lightdepth.command_line.words import spelled
 from lightdepth.commands.import_frames import import_frames as import_frames_verb
 from lightdepth.datasets import FrameSequence, VideoFile, open_sequence, write_folder

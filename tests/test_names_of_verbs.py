@@ -86,13 +86,22 @@ ROWS = [
 
 @pytest.mark.parametrize("command", ROWS)
 def test_a_verb_tells_no_name_in_what_it_makes_and_says(command, patient, tmp_path, capfd):
+    """With --json, when all that it says besides goes to standard error: its last lines are held against it here."""
     out = tmp_path / "out"
     if "OUT/" in command:
         out.mkdir()
-    assert main(typed(command, patient, out)) == 0
+    assert main([*typed(command, patient, out), "--json"]) == 0
     said = capfd.readouterr()
     assert CANARY not in (said.out + said.err).lower()
     assert telling(tmp_path, CANARY) == [] and ("OUT" not in command or any(out.iterdir()))
+    found, (then, written) = json.loads(said.out), said.err.splitlines()[-2:]
+    assert found["exit_code"] == 0 and found["verb"] == command.split()[0] and found["result"]
+    assert then == f"next: {found['next']}"
+    if "OUT" not in command:
+        assert written == "written: nothing" and found["files"] == []
+        return
+    assert written.startswith(f"written: {found['output']}") and found["output"].startswith(str(out))
+    assert set(found["files"]) == {str(p) for p in out.rglob("*") if p.is_file()}
 
 
 def test_a_verb_that_is_asked_to_keeps_the_names_of_its_inputs(patient, tmp_path, capfd):

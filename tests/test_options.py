@@ -11,17 +11,17 @@ import re
 import shlex
 from collections.abc import Iterator
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import get_args, get_origin
 
 import pytest
 from raising import warned
 
-from lightdepth.cli import GROUP, main, verb_parser
+from lightdepth.cli import main
 from lightdepth.command_line.gone_settings import without_gone
 from lightdepth.command_line.pages import PAGES
 from lightdepth.command_line.parsing import Parser, parsed
+from lightdepth.command_line.verbs import all_verbs, parsers_of
 from lightdepth.command_line.words import options
 from lightdepth.datasets import FORMATS, FormatName
 
@@ -35,25 +35,15 @@ UNIT = re.compile(
 MORE = re.compile(r"(?:^|[.;] )(More|Larger|A larger|A higher|A longer|Another)\b")
 """A sentence on what a larger number does; of seeds and places, what another one does."""
 ROOT = Path(__file__).parents[1]
-GENERAL = ("help", "config", "print_config", "print_shtab", "overwrite", "resume")
+GENERAL = ("help", "config", "print_config", "quiet", "json", "overwrite", "resume")
 
 
 @cache
 def parsers() -> dict[str, Parser]:
-    """The parser of every verb; `bench` has five, and `train` makes its own."""
+    """The parser of every verb; `bench` has five."""
     found = {}
-    for entry in metadata.entry_points(group=GROUP):
-        function = entry.load()
-        if entry.name == "train":
-            found["train"] = function.__globals__["training_parser"]()
-        elif entry.name == "bench":
-            for verb, name in (("bench", "run"), ("bench compare", "compare_runs")):
-                found[verb] = verb_parser(function.__globals__[name], verb)
-            found["bench estimators"] = verb_parser(function.__globals__["compare_estimators"], "bench estimators")
-            found["bench per-frame"] = verb_parser(function.__globals__["compare_per_frame"], "bench per-frame")
-            found["bench completion"] = verb_parser(function.__globals__["compare_completions"], "bench completion")
-        else:
-            found[entry.name] = verb_parser(function, entry.name)
+    for verb, entry in all_verbs().items():
+        found |= {f"{verb} {way}".rstrip(): parser for way, parser in parsers_of(verb, entry.load()).items()}
     return found
 
 
@@ -139,7 +129,7 @@ def test_help_has_two_examples_and_the_everyday_options_and_fits_100_columns(ver
     everyday = [a for a in options(parser) if page.shows(a.dest)]
     assert len([a for a in everyday if a.dest not in GENERAL]) <= 20
     lines = shown.splitlines()
-    entries = [line for line in lines if re.match(r"  (-|[a-z])", line) and not line.startswith("  lightdepth ")]
+    entries = [line for line in lines if re.match(r"  (-|[a-z{])", line) and not line.startswith("  lightdepth ")]
     assert len(entries) == len(everyday)
     assert max(len(line) for line in lines if not line.startswith("  lightdepth ")) <= 100
 
@@ -181,7 +171,7 @@ def test_the_examples_are_understood(verb):
     for example in PAGES[verb].examples:
         assert example.startswith(f"lightdepth {verb}")
         for command in example.split(" && "):
-            words = shlex.split(command)[1:]
+            words = shlex.split(command.partition(" > ")[0])[1:]
             if words[0] == "bench" and words[1:2] in (*(["compare"], ["estimators"], ["per-frame"], ["completion"]),):
                 words[:2] = [" ".join(words[:2])]
             if not any(word.startswith("configs/") for word in words):
@@ -199,7 +189,7 @@ def told(verb: str, argv: list[str], capsys) -> str:
     return line
 
 
-@pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "doctor"])  # which has none of its own
+@pytest.mark.parametrize("verb", [v for v in VERBS if v not in ("doctor", "completion")])  # without any
 def test_a_mistyped_option_is_told_the_nearest_one_in_one_line(verb, capsys):
     names = [a.option_strings[-1] for a in options(parsers()[verb]) if a.option_strings and a.dest not in GENERAL]
     longest = max((n.removesuffix("+") for n in names), key=len)

@@ -446,7 +446,7 @@ def test_a_run_that_was_stopped_and_resumed_ends_with_the_files_of_one_that_was_
     with pytest.raises(BaseException) as stopped:
         work(tmp_path / "out", stop, resume=False)
     said = " ".join([str(stopped.value), *getattr(stopped.value, "__notes__", [])])
-    assert "2 finished part(s) are kept: --resume goes on" in said
+    assert "2 finished parts are kept: --resume goes on" in said
     with refused("unfinished run of predict", cure="--resume"):
         work(tmp_path / "out", resume=False)
     made = []

@@ -14,9 +14,10 @@ import pytest
 from colons import colon, slam
 
 from lightdepth.camera import Pinhole
-from lightdepth.cli import GROUP, main, verb_parser
+from lightdepth.cli import main
 from lightdepth.command_line.parsing import parsed
 from lightdepth.command_line.presets import with_preset
+from lightdepth.command_line.verbs import GROUP, verb_parser
 from lightdepth.datasets import write_folder
 from lightdepth.tube.export import write_synthetic
 

@@ -115,7 +115,7 @@ def test_an_empty_folder_is_filled_and_a_file_is_no_folder(tmp_path):
 
 def test_part_of_the_work_may_fail_and_the_rest_is_written(tmp_path):
     with (
-        pytest.raises(PartialFailure, match=r"2 part\(s\) failed, the first: 7: truncated\. The rest is in .*out"),
+        pytest.raises(PartialFailure, match=r"2 parts failed, the first: 7: truncated\. The rest is in .*out"),
         run_folder(tmp_path / "out", "predict", {}) as run,
     ):
         run.fail("7", "truncated")
@@ -204,13 +204,14 @@ def lines_of(seconds: list[float], monkeypatch, capsys) -> list[str]:
 def test_a_slow_first_step_does_not_tell_how_long_the_others_take(monkeypatch, capsys):
     lines = lines_of([50.0, *[2.0] * 34], monkeypatch, capsys)
     assert lines[0] == "Densifying: 1/35" and lines[1] == "Densifying: 2/35"
-    assert lines[2] == "Densifying: 3/35, about 64 s left" and lines[20] == "Densifying: 21/35, about 28 s left"
+    assert lines[2] == "Densifying: 3/35, 2 s each, about 64 s left"
+    assert lines[20] == "Densifying: 21/35, 2 s each, about 28 s left"
 
 
 def test_the_time_left_is_that_of_recent_steps_and_of_no_fraction_of_a_second(monkeypatch, capsys):
     lines = lines_of([*[0.01] * 20, *[5.0] * 20], monkeypatch, capsys)
     assert not any("left" in line for line in lines[:20])
-    assert lines[35] == "Densifying: 36/40, about 20 s left"
+    assert lines[35] == "Densifying: 36/40, 5 s each, about 20 s left"
 
 
 def test_what_is_warned_of_during_a_run_is_shown_and_in_its_log_and_run_json(tmp_path):

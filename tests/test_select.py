@@ -336,7 +336,7 @@ def test_nothing_is_written_when_no_frame_is_kept_or_writing_fails(data, tmp_pat
     monkeypatch.setattr(
         "lightdepth.reporting.report.Report.write", lambda *_: (_ for _ in ()).throw(OSError(28, "disk full"))
     )
-    with pytest.raises(MachineFailure, match=r"the disk is full .*are kept: --resume goes on"):
+    with pytest.raises(MachineFailure, match=r"the disk is full .*is kept: --resume goes on"):
         select(data, tmp_path / "b" / "list.txt")
     assert not (tmp_path / "a").exists() and os.listdir(tmp_path / "b") == [".list.txt.unfinished"]
     for wrong in (tmp_path, tmp_path / "list.csv"):

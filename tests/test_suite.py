@@ -79,7 +79,7 @@ def rows_of(text: str, title: str) -> dict[tuple[str, ...], list[str]]:
 @pytest.mark.slow
 def test_one_command_makes_the_maps_dense_and_lays_the_paper_s_rows_beside_ours(trees, tmp_path):
     data, maps = trees
-    with pytest.raises(PartialFailure, match=r"9 part\(s\) failed, the first: t3a: trans_t3_a is not in"):
+    with pytest.raises(PartialFailure, match=r"9 parts failed, the first: t3a: trans_t3_a is not in"):
         evaluate(maps, data, tmp_path / "out", suite=SUITE, checkpoint="decline")
     out = tmp_path / "out"
     found = json.loads((out / "metrics.json").read_text())["sequences"]
@@ -101,7 +101,7 @@ def test_one_command_makes_the_maps_dense_and_lays_the_paper_s_rows_beside_ours(
 def test_runs_made_before_are_taken_as_they_are(trees, tmp_path):
     data, maps = trees
     shutil.copytree(maps / "cecum_t1_a", tmp_path / "runs" / "cecum_t1_a")
-    with pytest.raises(PartialFailure, match=r"11 part\(s\) failed"):
+    with pytest.raises(PartialFailure, match=r"11 parts failed"):
         evaluate(tmp_path / "runs", data, tmp_path / "out", suite=SUITE)
     found = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert list(found["all"]) == ["sparse"]  # one sequence: its figures are the file's
@@ -121,7 +121,7 @@ def test_a_suite_takes_recipe_settings_and_light_as_densify_does(trees, tmp_path
         "near": {"recipe": "paper", "light": "gamma=1.2,mu=0", "fusion": FusionConfig(far=1.0)},
         "fitted": {"recipe": "full"},
     }.items():
-        with pytest.raises(PartialFailure, match=r"11 part\(s\) failed"):
+        with pytest.raises(PartialFailure, match=r"11 parts failed"):
             evaluate(maps, trees[0], tmp_path / name, **given, **more)
         record = json.loads((tmp_path / name / "run.json").read_text())
         assert ("light_fits" in record) is (name == "fitted") and ("recipe" in record) is (name != "fitted")

@@ -23,6 +23,7 @@ MACHINERY = (
 _HIDDEN = "in a temporary folder that is hidden in the run folder in the making, whose models arrive by a rename"
 _RUN = "it is given the run, or its folder in the making"
 ALLOWED = {
+    "lightdepth/command_line/outcome.py: _streams": "os.devnull, where --quiet says all that it does not say",
     "lightdepth/commands/convert_camera.py: convert_camera": "each format's writer uses write_whole",
     "lightdepth/commands/import_frames.py: import_frames": _RUN,
     "lightdepth/commands/predict.py: _written": _RUN,

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
+from lightdepth.command_line.heartbeat import SECONDS
 from lightdepth.decline import informative, log_closed_form
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.frame import FrameBatch
@@ -59,25 +60,28 @@ class Panels(pl.Callback):
 
 
 class TrainingProgress(pl.Callback):
-    """One line every `every` steps, with speed and time left, and one per validation. `echo` takes each line.
+    """One line every `every` steps, and at least every ten seconds, with speed and time left, and one per validation.
+    `echo` takes each line.
 
     The logger gets the speed as frames per second, over all processes.
     """
 
     def __init__(self, echo: Callable[[str], None], every: int = 50) -> None:
         self.echo, self.every = echo, every
-        self._start, self._first = 0.0, 0
+        self._start, self._first, self._said = 0.0, 0, 0.0
 
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        self._start, self._first = time.monotonic(), trainer.global_step
+        self._start = self._said = time.monotonic()
+        self._first = trainer.global_step
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: FrameBatch, batch_idx: int
     ) -> None:
-        step, total = trainer.global_step, trainer.estimated_stepping_batches
-        if step % self.every and step != total:
+        step, total, now = trainer.global_step, trainer.estimated_stepping_batches, time.monotonic()
+        if step % self.every and step != total and now - self._said < SECONDS:
             return
-        rate = (step - self._first) / max(time.monotonic() - self._start, 1e-9)
+        self._said = now
+        rate = (step - self._first) / max(now - self._start, 1e-9)
         frames = rate * len(batch.image) * trainer.accumulate_grad_batches * trainer.world_size
         if trainer.logger is not None:
             trainer.logger.log_metrics({"train/frames_per_s": frames}, step=step)

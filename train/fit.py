@@ -23,6 +23,7 @@ import yaml
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from lightdepth.checkpoint import load_model, save_model
+from lightdepth.counting import counted
 from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.errors import InputError, Interrupted
 from lightdepth.files.named_inputs import write_inputs
@@ -140,7 +141,8 @@ def _fitted(
             settings = yaml.safe_dump(names.hidden(asked["settings"], exactly=True), sort_keys=False)
         write_whole(folder / "config.yaml", settings)
     echo(
-        f"{data.counts['train']} frames to train on, {data.counts['val']} to validate on, {data.size[0]}x{data.size[1]}"
+        f"{counted(data.counts['train'], 'frame')} to train on, {data.counts['val']} to validate on, "
+        f"{data.size[0]}x{data.size[1]}"
     )
     for sentence in data.doubts:
         echo(f"warning: {sentence}")

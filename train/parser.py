@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from lightdepth.cli import KEEP_NAMES
 from lightdepth.command_line.pages import PAGES
+from lightdepth.command_line.verbs import KEEP_NAMES
 from lightdepth.ranges import SEED
 
 from .trainer_options import TrainerSettings
@@ -61,7 +61,7 @@ def training_parser() -> Parser:
 def as_yaml(parser: ArgumentParser, config: Namespace) -> str:
     """The settings of a run, without where it goes and what becomes of what is there."""
     kept = config.clone()
-    for key in ("config", "preset", "output", "resume", "overwrite", "keep_names"):
+    for key in ("config", "preset", "output", "resume", "overwrite", "keep_names", "quiet", "json"):
         kept.pop(key, None)
     result: str = parser.dump(kept, skip_validation=True)
     return result

@@ -12,6 +12,7 @@ import lightning.pytorch as pl
 from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging, LearningRateMonitor, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
+from lightdepth.command_line.outcome import is_quiet, outcome
 from lightdepth.errors import InputError
 from lightdepth.foreign_text import for_line
 from lightdepth.ranges import BELOW_ONE, at_least, checked
@@ -83,7 +84,7 @@ def with_callbacks(
     if options["logger"] is not False:
         extra.append(LearningRateMonitor("step"))
     if options.get("enable_progress_bar") is None:
-        options["enable_progress_bar"] = sys.stderr.isatty()
+        options["enable_progress_bar"] = sys.stderr.isatty() and not is_quiet()
     if options["enable_progress_bar"]:
         extra.append(RichProgressBar())
     callbacks = options.get("callbacks") or []
@@ -114,6 +115,8 @@ class Echo:
     def __call__(self, line: str) -> None:
         if not first_process():
             return
-        print(for_line(line), file=sys.stderr, flush=True)
+        if not is_quiet() or line.startswith("warning: "):
+            print(for_line(line), file=sys.stderr, flush=True)
+        outcome().stage(line)
         with self.log.open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(for_line(self.names.text(line)) + "\n")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from densify.bench import per_frame
@@ -39,6 +40,9 @@ from densify.config import DensifyConfig, OfflineConfig, Recipe
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, ModelSource
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end, outcome
+from lightdepth.command_line.parsing import Parser
+from lightdepth.command_line.verbs import verb_parser
 from lightdepth.errors import InputError
 from lightdepth.files.images import write_image
 from lightdepth.files.replacing import check_rewritable
@@ -54,18 +58,27 @@ from lightdepth.reporting.run import Run, plain, recorded, run_folder
 
 def bench(argv: list[str]) -> int:
     """The built-in benchmark on synthetic colons; with compare, estimators, per-frame or completion another one."""
+    ways = _ways()
+    if argv and argv[0] in ways:
+        ways[argv[0]](**parse(ways[argv[0]], f"bench {argv[0]}", argv[1:]))
+    else:
+        run(**parse(run, "bench", argv))
+    return 0
 
-    of: dict[str, Callable[..., None]] = {
+
+def _ways() -> dict[str, Callable[..., None]]:
+    return {
         "compare": compare_runs,
         "estimators": compare_estimators,
         "per-frame": compare_per_frame,
         "completion": compare_completions,
     }
-    if argv and argv[0] in of:
-        of[argv[0]](**parse(of[argv[0]], f"bench {argv[0]}", argv[1:]))
-    else:
-        run(**parse(run, "bench", argv))
-    return 0
+
+
+def parsers() -> dict[str, Parser]:
+    """What the command line of bench is, and of each of its other ways."""
+    ways = {way: verb_parser(function, f"bench {way}") for way, function in _ways().items()}
+    return {"": verb_parser(run, "bench")} | ways
 
 
 def run(
@@ -139,6 +152,7 @@ def run(
         if picture is not None:
             (folder.folder / "bench.png").write_bytes(picture)
         folder.log(text)
+    end(output, then=f"lightdepth bench compare {quote(str(output))} OTHER", page=output / "bench.md")
 
 
 def _cells(
@@ -176,16 +190,18 @@ def compare_runs(a: Path, b: Path, output: Path | None = None, seed: Annotated[i
     if output is not None:
         check_rewritable(output, '{\n "kind": "bench comparison"', [a, b])
     found = compare(read_bench(a), read_bench(b), seed)
-    print(found.markdown(str(a), str(b)))
+    outcome().last(found.markdown(str(a), str(b)))
+    data = {
+        "kind": "bench comparison",
+        "a": told(str(a), a=a),
+        "b": told(str(b), b=b),
+        **asdict(found),
+        "verdict": found.verdict,
+    }
     if output is not None:
-        data = {
-            "kind": "bench comparison",
-            "a": told(str(a), a=a),
-            "b": told(str(b), b=b),
-            **asdict(found),
-            "verdict": found.verdict,
-        }
         write_whole(output, json.dumps(plain(data), indent=1) + "\n")
+    written = [] if output is None else [output]
+    end(*written, then="lightdepth bench -o OTHER --size full", result=plain(data))
 
 
 def compare_estimators(
@@ -222,6 +238,7 @@ def compare_estimators(
         (folder.folder / "estimators.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         (folder.folder / "estimators.png").write_bytes(estimators_picture(records))
         folder.log(text)
+    end(output, then="lightdepth bench estimators -o OTHER --draws 200", page=output / "estimators.md")
 
 
 def compare_per_frame(
@@ -273,6 +290,9 @@ def compare_per_frame(
         (folder.folder / "per-frame.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         write_image(folder.folder / "colons.png", per_frame.contact_sheet(sequences))
         folder.log(text)
+    made = quote(str(output / "colons" if colons is None else colons))
+    then = f"lightdepth bench per-frame -o OTHER --colons {made} --checkpoints '[CHECKPOINT]'"
+    end(output, then=then, page=output / "per-frame.md")
 
 
 def compare_completions(
@@ -332,6 +352,8 @@ def compare_completions(
         page.files(folder.folder, {"completion.md": "the tables", "completion.json": "every figure, for programs"})
         page.write(folder.folder / "report.html")
         folder.log(text)
+    then = "lightdepth bench completion -o OTHER --external '[NAME=FOLDER]'"
+    end(output, then=then, page=output / "report.html")
 
 
 def _write_json(run: Run, name: str, data: Mapping[str, object]) -> None:

@@ -15,6 +15,7 @@ from densify.evaluation.truth import read_truth
 from densify.page import FILES, densify_page
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.datasets import open_sequence
 from lightdepth.errors import InputError
 from lightdepth.maps import read_map
@@ -94,4 +95,4 @@ def demo(
         )
         page.files(run.folder, FILES)
         page.write(run.folder / "report.html")
-        run.log(f"{output}/report.html")
+    end(output, then="lightdepth import VIDEO -o DATA", page=output / "report.html")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
@@ -11,6 +12,7 @@ from densify.joining import MergeConfig
 from densify.page import FILES, densify_page, joined_section
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.datasets import SequenceSource
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
@@ -79,4 +81,5 @@ def densify(
             joined_section(page, work.merged)
         page.files(run.folder, FILES)
         page.write(run.folder / "report.html")
-        run.log(f"{output}/report.html")
+    then = f"lightdepth measure {quote(str(output))} --frame NUMBER --pixels '[[U, V], [U, V]]'"
+    end(output, then=then, page=output / "report.html")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 
 from densify.config import DensifyConfig
 from densify.evaluation.depth_files import DepthReading
@@ -13,6 +14,7 @@ from densify.evaluation.records import Sources
 from densify.evaluation.tables import write_evaluations
 from densify.judged import DenseModel, JudgingConfig, TruthSource, dense_first, judge_asked, read_asked
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.reporting.run import recorded, run_folder
 
 
@@ -69,4 +71,4 @@ def evaluate(
         sources = Sources(run, source.truth, gap, "" if first is None else str(first))
         write_evaluations(answer.found, out.folder, answer.withheld, sources, asked.suite)
         out.log(in_short(answer.found, answer.withheld, sources))
-        out.log(f"every figure: {folder}/metrics.md")
+    end(folder, then=f"cat {quote(str(folder / 'metrics.md'))}", page=folder / "metrics.md")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal, get_args
 
 from densify.dense_map import map_folders
 from densify.exporting.work import MAP_KINDS, MapExport, export_maps
 from lightdepth.checkpoint import load_called
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.errors import InputError, MissingOption
 from lightdepth.exporting.work import DEPTH_KINDS, MODEL_KINDS, export_depth, export_model
 from lightdepth.models import NetworkModel
@@ -18,6 +20,14 @@ from lightdepth.reporting.run import recorded, run_folder
 Kind = Literal[
     "colmap", "nerfstudio", "ply", "glb", "obj", "tum", "climb", "png", "exr", "onnx", "torch", "safetensors"
 ]
+
+
+_OPENED = {
+    "colmap": "colmap model_analyzer --path OUT/map_000/sparse/0",
+    "nerfstudio": "ns-train splatfacto --data OUT/map_000",
+    "safetensors": "lightdepth predict DATA --checkpoint OUT -o runs/depth",
+}
+"""What to type next, by what was written."""
 
 
 def export(
@@ -67,7 +77,7 @@ def export(
             export_depth(run, path, to, step)
         else:
             export_maps(run, path, to, maps)
-        run.log(f"{output}")
+    end(output, then=_OPENED.get(to, "ls OUT").replace("OUT", quote(str(output))))
 
 
 def _network(checkpoint: str) -> NetworkModel:

@@ -11,6 +11,7 @@ from densify.live.play import play
 from densify.live.record import PlayedRun
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.ranges import above, at_least
@@ -74,3 +75,4 @@ def live(
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:
             played = play(frames, sparse_map, model, config, result.add, rate, lambda _: bar.advance())
         result.finish(played, model.name, rate, budget_ms)
+    end(output, then="lightdepth densify DATA --map MAP -o runs/dense", page=output / "report.html")

@@ -10,6 +10,7 @@ import numpy as np
 
 from densify.evaluation.judged_map import read_run
 from densify.measure import chosen_map, measured, places_in_frame, run_unit
+from lightdepth.command_line.outcome import end, outcome
 from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_rewritable
 from lightdepth.files.writing import write_whole
@@ -66,7 +67,11 @@ def measure(
     found = measured(dense, places, radius, mm_per_unit or 1.0)
     result = {"run": told(str(run), run=run), "map": dense.id, "unit": unit, **found.record()}
     known = dense.camera.provenance
-    result["warnings"] = [known.doubt] if known is not None and known.doubt else []
-    print(found.summary(unit))
+    doubts = [known.doubt] if known is not None and known.doubt else []
+    result["warnings"] = doubts
+    outcome().last(found.summary(unit))
     if output is not None:
         write_whole(output, json.dumps(plain(result), indent=1) + "\n")
+    kept = "lightdepth measure RUN ... -o lengths.json"
+    then = kept if output is None else "lightdepth export RUN -o runs/glb --to glb"
+    end(*([output] if output else []), then=then, result=plain(result), doubts=doubts)

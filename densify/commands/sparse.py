@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import numpy as np
 
 from densify.inputs import MapSource, map_and_frames
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.reading import stamps_of
 from lightdepth.errors import InputError
@@ -91,11 +93,11 @@ def sparse(
         run.hash_inputs(**source.files, repair=repair, poses=None if poses in (None, "truth") else Path(poses))
         if repair is not None:
             map_and_frames(run, source, MapSource.read_as(repair, reading, repair_map=True), sfm)
-            return
-        frames = open_frames(source, run, None, sfm).without_truth()
-        known = None if poses is None else _poses(poses, frames, source, reading)
-        made_sparse(run, frames, sfm, known, source.image_files)
-        run.log(f"{output}/sparse")
+        else:
+            frames = open_frames(source, run, None, sfm).without_truth()
+            known = None if poses is None else _poses(poses, frames, source, reading)
+            made_sparse(run, frames, sfm, known, source.image_files)
+    end(output, then=f"lightdepth densify DATA --map {quote(str(output / 'sparse'))} -o runs/dense")
 
 
 def _poses(given: str, frames: FrameSequence, source: SequenceSource, reading: MapReading) -> dict[int, np.ndarray]:

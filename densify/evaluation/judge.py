@@ -29,6 +29,7 @@ from densify.evaluation.truth import Truth, shared_frames
 from densify.similarity import Similarity
 from lightdepth.errors import InputError
 from lightdepth.files.schema import read_json
+from lightdepth.reporting.progress import counted_through
 from lightdepth.sparse_map import check_rigid
 
 THRESHOLDS_MM = (1.0, 2.0, 5.0)
@@ -58,7 +59,7 @@ def judge_maps(
     aligned: list[AlignedTrajectory] = []
     errors: dict[str, list[SurfaceErrors]] = {name: [] for name in _CLOUDS}
     meshes = []
-    for m in models:
+    for m in counted_through(models, "Judging maps"):
         alone = MapFigures(m.trajectory.id, int(m.trajectory.keyframe.sum()))
         try:
             found = align_trajectory(m.trajectory, truth.poses, mm_per_unit)

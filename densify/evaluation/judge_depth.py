@@ -16,6 +16,7 @@ from densify.evaluation.truth import shared_frames
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
+from lightdepth.reporting.progress import counted_through
 
 
 def judge_depth(
@@ -39,7 +40,7 @@ def judge_depth(
     skipped: dict[str, str] = {}
     within: dict[str, list[np.ndarray]] = {name: [] for name in ALIGNMENTS}
     units = set()
-    for number in numbers:
+    for number in counted_through(numbers, "Judging depth"):
         frame = truth.by_number(number)
         assert frame is not None
         prediction = reading.read(files[number], frame.camera)

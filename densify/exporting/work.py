@@ -15,6 +15,7 @@ from densify.exporting.meshes import write_mesh, write_surfaces
 from densify.exporting.nerfstudio import write_nerfstudio
 from densify.exporting.trees import write_climb, write_trajectory
 from lightdepth.calibration import read_camera
+from lightdepth.counting import counted
 from lightdepth.datasets import FORMATS, FrameSequence, open_sequence
 from lightdepth.errors import InputError
 from lightdepth.ranges import ANY, at_least, checked
@@ -54,8 +55,8 @@ def export_maps(run: Run, source: Path, to: str, options: MapExport) -> None:
         seconds = run_record(source).get("seconds")
         work = float(seconds) if isinstance(seconds, (int, float)) else 0.0
         write_climb(single, run.folder, times, options.frame_offset, options.points, (0.0, work))
-        counted = f"frames counted from {options.frame_offset}, in {single[0].unit}"
-        run.log(f"3D_maps/, camera_trajectory/ and runtime.txt have {len(single)} maps, {counted}")
+        how = f"frames counted from {options.frame_offset}, in {single[0].unit}"
+        run.log(f"3D_maps/, camera_trajectory/ and runtime.txt have {counted(len(single), 'map')}, {how}")
         return
     with Progress("Exporting keyframes", sum(len(m.submap.keyframes) for m in maps)) as bar:
         for exported in maps:
@@ -94,7 +95,7 @@ def _write_map(
         run.warn(f"{exported.name}: {words}")
     made = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir()))
     vertices = "" if to == "tum" else f"{len(exported.dense.vertices)} vertices, "
-    run.log(f"{exported.name}/ has {made}: {keyframes} keyframes, {vertices}in {exported.unit}")
+    run.log(f"{exported.name}/ has {made}: {counted(keyframes, 'keyframe')}, {vertices}in {exported.unit}")
 
 
 def _keep_origin(run: Run, source: Path, name: str) -> None:

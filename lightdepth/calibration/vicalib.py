@@ -32,6 +32,7 @@ from lightdepth.camera import (
     camera_of,
     opencv_camera,
 )
+from lightdepth.counting import counted
 from lightdepth.errors import InputError
 from lightdepth.files.text import to_numbers
 from lightdepth.files.writing import write_whole
@@ -158,7 +159,7 @@ def _only(root: Element, tag: str, path: Path) -> Element:
 def _numbers(parent: Element, tag: str, path: Path, count: int) -> list[float]:
     """The numbers of the element, written [ a; b; ... ] or bare."""
     found = parent.find(f".//{tag}")
-    where, expected = f"{path}: {tag}", f"{count} number{'s' * (count > 1)}"
+    where, expected = f"{path}: {tag}", counted(count, "number")
     if found is None:
         raise InputError(where, "missing", f"expected {expected}")
     words = (found.text or "").translate(str.maketrans("[];,", "    ")).split()

@@ -29,7 +29,7 @@ GONE_SETTINGS: dict[str, dict[str, str]] = {
     },
 }
 """By verb, the dotted keys that are gone, each with what became of it. A key stands for all that is below it."""
-GIVEN_WITH_EACH_RUN = ("output", "overwrite", "resume", "table", "config", "preset")
+GIVEN_WITH_EACH_RUN = ("output", "overwrite", "resume", "table", "config", "preset", "quiet", "json")
 """Options that no file sets: a file of someone else's does not say what is written where, and what is replaced there.
 So the config.yaml of a run serves for another one."""
 

@@ -19,6 +19,7 @@ from lightdepth.command_line.kinds import choices_of_type, expected, list_apart,
 from lightdepth.command_line.pages import Page
 from lightdepth.command_line.settings_yaml import read_settings
 from lightdepth.command_line.words import dashed, options, underscored
+from lightdepth.errors import WrongUsage
 from lightdepth.foreign_text import for_terminal
 from lightdepth.regular import regular
 
@@ -31,8 +32,10 @@ def where_given(argv: Sequence[str], action: argparse.Action) -> str:
 
 def fail(parser: ArgumentParser, message: str) -> NoReturn:
     """Ends the program for wrong usage, with one line."""
-    print(for_terminal(f"{parser.prog}: error: {' '.join(message.split())}"), file=sys.stderr)
-    raise SystemExit(2)
+    said = " ".join(message.split())
+    print(for_terminal(f"{parser.prog}: error: {said}"), file=sys.stderr)
+    found, sign, page = said.partition("Read on: ")
+    raise WrongUsage(found.rstrip(" ."), sign + page)
 
 
 def one_line(parser: ArgumentParser, page: Page, argv: Sequence[str], message: str) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 _ALWAYS_RARE = (
-    *("print_config", "print_shtab", "map_sensor", "time_tolerance", "map_folder", "frame_offset", "keep_names"),
+    *("print_config", "map_sensor", "time_tolerance", "map_folder", "frame_offset", "keep_names"),
     "device",
 )
 
@@ -169,6 +169,12 @@ PAGES = {
         (
             "lightdepth measure runs/dense --points '[[0, 0, 30], [4, 2, 41]]' --mm-per-unit 3.1",
             "lightdepth measure runs/dense --frame 120 --pixels '[[310, 200], [420, 260]]'",
+        )
+    ),
+    "completion": Page(
+        (
+            "lightdepth completion bash > ~/.local/share/bash-completion/completions/lightdepth",
+            "lightdepth completion fish > ~/.config/fish/completions/lightdepth.fish",
         )
     ),
     "export": Page(

@@ -19,10 +19,12 @@ from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_pa
 
 from lightdepth.command_line.kinds import METAVARS, choices_of_type, leaves, literals, placeholder
 from lightdepth.command_line.mistakes import check_config, config_files, fail, one_line, where_given
+from lightdepth.command_line.outcome import SAID_OF
 from lightdepth.command_line.pages import Page
 from lightdepth.command_line.ranges import check_ranges, range_in, set_ranges, taken
 from lightdepth.command_line.settings_yaml import take_plain_values, use_words
 from lightdepth.command_line.words import as_list, dashed, is_head, listed, options, spelled
+from lightdepth.counting import counted
 from lightdepth.ranges import Range
 
 HELP, HELP_ALL = ("-h", "--help"), ("--help-all", "--help_all")
@@ -31,11 +33,10 @@ _OPTION = re.compile(r"(?<![\w/.-])--[A-Za-z][\w.-]*")
 _GENERAL = {
     "help": "Show the everyday options, with examples, and exit.",
     "config": "YAML file with any of these options; those on the command line win.",
-    "print_shtab": "Print a script for the shell that completes the names of options, and exit.",
     "print_config": "Print all settings, those given before it among them, as YAML that --config reads, and exit. "
     "`=skip_null` leaves out those that are not set.",
 }
-_LAST = ("overwrite", "resume", "config", "print_config", "print_shtab", "help")
+_LAST = ("overwrite", "resume", "quiet", "json", "config", "print_config", "help")
 _GROUP = "YAML file with any of the options of this group."
 
 
@@ -80,7 +81,7 @@ class Parser(ArgumentParser):
         shown = [a for a in options(self) if everything or self.page.shows(a.dest)]
         rest = len(options(self)) - len(shown)
         self.usage = self._short_usage()
-        self.epilog = f"{self.prog} --help-all shows {rest} more option{'s' * (rest > 1)}." if rest else None
+        self.epilog = f"{self.prog} --help-all shows {counted(rest, 'more option')}." if rest else None
         kept = {id(action) for action in shown}
         hidden = [a for a in self._actions if id(a) not in kept and not (everything and is_head(a))]
         helps = [action.help for action in hidden]
@@ -129,6 +130,8 @@ class Parser(ArgumentParser):
 def finish(parser: Parser, page: Page, ranges: Mapping[str, Range]) -> None:
     """Gives a parser that has all its options its page and their ranges, and the library's own options our words."""
     parser.page = page
+    for name, text in SAID_OF.items():  # taken before options are read (outcome.manners); here for help and mistakes
+        parser.add_argument(f"--{name}", action="store_true", help=text)
     set_ranges(parser._actions, ranges)
     plain = [a for a in options(parser) if "." not in a.dest]
     order = sorted(plain, key=lambda a: (bool(a.option_strings), a.dest != "output", a.dest in _LAST))

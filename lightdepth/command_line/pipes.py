@@ -9,6 +9,7 @@ import errno
 import io
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
@@ -25,8 +26,11 @@ class Outliving:
     def __init__(self, stream: TextIO):
         self._stream = stream
         self.failed: OSError | None = None
+        self.heard = time.monotonic()
+        """when something was written last"""
 
     def write(self, text: str) -> int:
+        self.heard = time.monotonic()
         try:
             return self._stream.write(text)
         except OSError as error:

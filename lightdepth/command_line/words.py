@@ -20,8 +20,9 @@ def options(parser: ArgumentParser) -> list[argparse.Action]:
     """What can be typed: options and positional arguments, without the heads of groups and the library's own helps."""
     found = []
     for action in parser._actions:
-        linked = type(action).__name__ == "ActionLink"
-        if not linked and not is_head(action) and not action.dest.endswith(".help"):
+        # The library's --print_shtab does nothing but fail.
+        aside = type(action).__name__ == "ActionLink" or "--print_shtab" in action.option_strings
+        if not aside and not is_head(action) and not action.dest.endswith(".help"):
             found.append(action)
     return found
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import numpy as np
 
 from lightdepth.calibration import write_light
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.datasets import FormatName, SequenceSource
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
@@ -21,6 +23,7 @@ from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.light.report import light_page
 from lightdepth.ranges import SEED, Range
 from lightdepth.reporting.names import told
+from lightdepth.reporting.same import plain
 
 
 def calibrate_light(
@@ -80,4 +83,7 @@ def calibrate_light(
             output: lambda path: write_light(fit.light, path),
         }
     )
-    print(f"light: {fit.summary()}\n{output}, {page_path}")
+    print(f"light: {fit.summary()}")
+    then = f"lightdepth densify DATA --map MAP --light {quote(str(output))} -o runs/dense"
+    result = {"light": plain(fit.light), "errors": fit.errors, "uncertainty": fit.uncertainty, "said": fit.summary()}
+    end(output, page_path, then=then, page=page_path, result=result)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 from lightdepth import camera_conversion
 from lightdepth.calibration import read_camera, write_camera
+from lightdepth.command_line.outcome import end, is_quiet, outcome
 from lightdepth.datasets.sequence import read_mask
 from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_files
@@ -69,4 +71,10 @@ def convert_camera(
         camera = replace(found.camera, provenance=camera.provenance)
     write_camera(camera, output, to)
     doubt = "" if camera.provenance is None else camera.provenance.doubt
-    print("\n".join([said, *([f"warning: {doubt}"] if doubt else []), str(output)]))
+    if not is_quiet():
+        print(said)
+    if doubt:
+        print(f"warning: {doubt}", file=outcome().doubts)
+    doubts = [doubt] if doubt else []
+    then = f"lightdepth import VIDEO -o DATA --camera {quote(str(output))}"
+    end(output, then=then, result={"model": camera.name, "said": said}, doubts=doubts)

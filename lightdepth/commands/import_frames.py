@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
 from lightdepth.importing.doubts import doubts, facts
@@ -105,4 +107,5 @@ def import_frames(
         for each in found:
             run.log(f"! {each.found} {each.cure}")
         run.log(f"{len(chosen)} of {len(scan.rows)} frames kept" + ("" if frames else "; the report alone was written"))
-    print(f"{output / 'report.html'}")
+    then = f"lightdepth densify {quote(str(output))} -o runs/dense" if frames else "lightdepth import VIDEO -o DATA"
+    end(output, then=then, page=output / "report.html")

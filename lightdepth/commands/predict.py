@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from lightdepth.checkpoint import ModelSource
 from lightdepth.colour import ColourMeter
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.datasets import SequenceSource
 from lightdepth.depth_gate import DepthGate, sentence
 from lightdepth.errors import InputError
@@ -111,6 +113,7 @@ def predict(
         run.record["colour"] = colours.record()
         run.record["checkpoint"] = model.name
         run.record["uncertainty_factor"] = factor
+    end(output, then=f"lightdepth export {quote(str(output))} -o runs/png --to png")
 
 
 def _written(folder: Path, frame: Frame, prediction: DepthPrediction, previews: bool) -> list[Path]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 from lightdepth.calibration import read_light
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
+from lightdepth.counting import counted
 from lightdepth.datasets.c3vd import C3VD
 from lightdepth.errors import InputError
 from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least, checked
@@ -150,4 +153,7 @@ def synth(
         moved = None if errors == MapErrors() else moved_ids(right.map, export.map)
         wall = None if sequence.breathing is not None else sequence.tube.shape  # no one mesh holds a wall that moves
         write_synthetic(made, export, run.folder, layout, moved, wall)
-        run.log(f"{colon.frames} frames, {len(export.map.submaps)} submaps in {output}")
+        run.log(f"{counted(colon.frames, 'frame')}, {counted(len(export.map.submaps), 'submap')}")
+    place = output if layout == "frames" else output / "sequence"
+    then = f"lightdepth densify {quote(str(place))} --map {quote(str(output / 'slam'))} -o runs/dense"
+    end(output, then=then)

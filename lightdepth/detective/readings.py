@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole
+from lightdepth.counting import counted
 from lightdepth.datasets.counting import BY_NUMBER, Counting
 from lightdepth.detective.witnesses import PixelMap
 from lightdepth.maps.checks import OTHER_READINGS
@@ -43,7 +44,7 @@ _RATES = (
 
 def shifted(offset: int) -> Reading:
     """Every keyframe is the frame `offset` later."""
-    many = f"{abs(offset)} frame{'s' * (abs(offset) > 1)} {'later' if offset > 0 else 'earlier'}"
+    many = f"{counted(abs(offset), 'frame')} {'later' if offset > 0 else 'earlier'}"
     cure = f'add {offset} to --frame-offset, or to "frame_offset" in {SIDECAR} beside the map (0 where there is none)'
     return Reading(f"every keyframe is {many}", cure, Counting(offset=offset))
 

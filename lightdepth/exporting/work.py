@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from lightdepth.counting import counted
 from lightdepth.errors import InputError
 from lightdepth.exporting.checkpoints import GRAPH_FILES, GraphKind, write_graph, write_pretrained
 from lightdepth.exporting.depth import checked_step, depth_of, fitting_step, write_png16
@@ -54,4 +55,4 @@ def export_depth(run: Run, folder: Path, to: str, step: float | None) -> None:
     scale = f" --depth-scale {chosen:g}" if unit == "mm" else ""
     scale = scale if to == "png" or unit != "mm" else " --depth-scale 1"
     codes = f"{f'; one code is {chosen:g}' if to == 'png' else ''} (evaluate --depth-kind depth{scale})"
-    run.log(f"{len(files)} .{to} files of depth along the axis, {unit}, 0 where unknown{codes}")
+    run.log(f"{counted(len(files), f'.{to} file')} of depth along the axis, {unit}, 0 where unknown{codes}")

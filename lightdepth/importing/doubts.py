@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lightdepth.counting import counted
 from lightdepth.importing import findings as finding
 from lightdepth.importing.findings import Finding
 from lightdepth.importing.pictures import Geometry
@@ -44,7 +45,7 @@ def doubts(
         boxes = ", ".join(f"{w}x{h} at ({x}, {y})" for x, y, w, h in regions.overlay.boxes)
         found.append(
             Finding(
-                f"Burnt-in text or graphics in {len(regions.overlay.boxes)} place(s): {boxes}. They are "
+                f"Burnt-in text or graphics in {counted(len(regions.overlay.boxes), 'place')}: {boxes}. They are "
                 "black in the frames and invalid in the mask.",
                 "Look at the frames before they leave the house: text that shows only briefly is not found; black it "
                 "out with --overlay-mask FILE.",

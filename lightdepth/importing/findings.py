@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lightdepth.counting import counted
 from lightdepth.datasets.clip import uneven
 from lightdepth.image_quality import BLACK, Measures, combed
 from lightdepth.importing.selection import BLURRED, DOUBLE, FROZEN, KEPT, UNREADABLE
@@ -95,8 +96,8 @@ def of_frames(measures: Measures, fate: np.ndarray, times: np.ndarray) -> list[F
     if jumps > max(2, JUMPS_SHARE * count):
         findings.append(
             Finding(
-                f"Brightness jumps by more than {JUMP:.0%} from one frame to the next {jumps} times: automatic "
-                "exposure or flicker.",
+                f"Brightness jumps by more than {JUMP:.0%} from one frame to the next {counted(jumps, 'time')}: "
+                "automatic exposure or flicker.",
                 "Scale per frame is not affected; methods that compare brightness between frames are. Fix the exposure "
                 "when recording, if the endoscope lets you.",
             )
@@ -184,4 +185,4 @@ def _runs(which: np.ndarray) -> str:
     """`3 stretches, the longest of 12 frames`."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], which.astype(int), [0]])))
     lengths = edges[1::2] - edges[::2]
-    return f"{len(lengths)} stretch{'es' if len(lengths) != 1 else ''}, the longest of {lengths.max()} frames"
+    return f"{counted(len(lengths), 'stretch', 'stretches')}, the longest of {counted(int(lengths.max()), 'frame')}"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lightdepth.counting import counted
 from lightdepth.image_quality import Measures
 from lightdepth.importing.findings import Finding, exposure_jumps
 from lightdepth.importing.selection import KEPT
@@ -50,7 +51,9 @@ def import_page(
     page.table(["frames", "count"], [[name, count] for name, count in Counter(fate.tolist()).most_common()])
     page.heading("Frame by frame")
     page.table(["", "median", "lowest tenth", "highest tenth"], _rows(measures))
-    page.text(f"Brightness jumps by more than 15 % from one frame to the next {exposure_jumps(measures)} times.")
+    page.text(
+        f"Brightness jumps by more than 15 % from one frame to the next {counted(exposure_jumps(measures), 'time')}."
+    )
     page.figures(_charts(measures, fate, axis))
     if pictures:
         page.heading("Pictures")

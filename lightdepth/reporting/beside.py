@@ -10,7 +10,7 @@ from typing import Any
 from lightdepth.files.lock import locked
 from lightdepth.files.replacing import check_name, check_ours, discard, unfinished_path
 from lightdepth.files.writing import folders_for
-from lightdepth.reporting.run import Run, going_on, kept_or_gone
+from lightdepth.reporting.run import Run, going_on, kept_or_gone, kept_parts
 from lightdepth.reporting.unfinished import begun_with, clean, finished_parts
 
 
@@ -39,7 +39,7 @@ def kept_beside(
         with kept_or_gone(run, real, True), run.hearing():
             if parts:
                 clean(made, parts)
-                print(f"resumed: {len(parts)} finished part(s) are kept", flush=True)
+                print(f"resumed: {kept_parts(parts)}", flush=True)
             else:
                 made.mkdir(mode=0o700)
                 run.begin()

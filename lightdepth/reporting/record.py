@@ -13,6 +13,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from lightdepth.command_line.outcome import outcome
 from lightdepth.files.replacing import listed
 from lightdepth.files.writing import write_whole
 from lightdepth.reporting.names import Names
@@ -58,6 +59,7 @@ def write_run_json(
         "files": listed(folder),
     }
     write_whole(folder / "run.json", json.dumps(data, indent=1) + "\n")
+    outcome().record = data
 
 
 def versions() -> dict[str, str]:

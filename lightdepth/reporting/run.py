@@ -15,6 +15,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
+from lightdepth.command_line.outcome import outcome
+from lightdepth.counting import counted
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.lock import locked
 from lightdepth.files.machine import machine_failure
@@ -126,9 +128,11 @@ class Run:
         """Lines for log.txt, and for the user, who reads the names of options in the place of their paths."""
         self._tell(message, for_terminal)
 
-    def _tell(self, message: str, shown: Callable[[str], str]) -> None:
+    def _tell(self, message: str, shown: Callable[[str], str], out: TextIO | None = None) -> None:
         self._say = self._say or (str if self.keep_names else spoken(self._given))
-        print(shown(self._say(message)), flush=True)
+        said = shown(self._say(message))
+        print(said, file=out, flush=True)
+        outcome().stage(said)
         self._note(message, shown)
 
     def _note(self, message: str, shown: Callable[[str], str] = for_line) -> None:
@@ -138,12 +142,13 @@ class Run:
     def fail(self, what: str, reason: str) -> None:
         """Part of the work failed; the rest goes on (exit code 4 at the end)."""
         self.record["failures"].append({"what": what, "reason": reason})
-        self._tell(f"failed: {what}: {reason}", for_line)
+        self._tell(f"failed: {what}: {reason}", for_line, outcome().doubts)
 
     def warn(self, message: str) -> None:
         """Something is doubtful; the work goes on. It is in the log and in run.json."""
         self.record["warnings"].append(message)
-        self._tell(f"warning: {message}", for_line)
+        outcome().warned(message)
+        self._tell(f"warning: {message}", for_line, outcome().doubts)
 
     def warn_once(self, message: str) -> None:
         """As warn, unless that was said before."""
@@ -280,6 +285,7 @@ def run_folder(
                 received = ending.enter_context(finishing_first())  # a signal waits until the result is in its place
                 run.finish()
             replace(run.folder, real, before)
+            outcome().made(output, run.record["warnings"])
             received.stop(f"it was at its last step, and {real.name} is whole")
     except OSError as error:
         failure = machine_failure(error, place=real)
@@ -292,7 +298,7 @@ def run_folder(
     if run.record["failures"]:
         first = run.record["failures"][0]
         raise PartialFailure(
-            f"{len(run.record['failures'])} part(s) failed, the first: {first['what']}: {first['reason']}. "
+            f"{counted(len(run.record['failures']), 'part')} failed, the first: {first['what']}: {first['reason']}. "
             f"The rest is in {output}"
         )
 
@@ -347,12 +353,17 @@ def _begin(run: Run) -> None:
     """Its folder is made, or freed of what no finished part has."""
     if run.parts:
         clean(run.folder, run.parts)
-        run.log(f"resumed: {len(run.parts)} finished part(s) are kept")
+        run.log(f"resumed: {kept_parts(run.parts)}")
         return
     run.folder.mkdir(mode=0o700)
     special = stat.S_IMODE(run.folder.stat().st_mode) & ~0o777  # a folder of a group hands its group on
     run.folder.chmod(special | 0o700)  # until it is finished its files name the inputs
     run.begin()
+
+
+def kept_parts(parts: Mapping[str, Part]) -> str:
+    """How many finished parts of a run there are, in words."""
+    return f"{counted(len(parts), 'finished part')} {'is' if len(parts) == 1 else 'are'} kept"
 
 
 @contextmanager
@@ -362,7 +373,7 @@ def kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
         yield
     except BaseException as error:
         kept = bool(resumable and run.parts and not isinstance(error, InputError))
-        said = f"{len(run.parts or ())} finished part(s) are kept: --resume goes on" if kept else ""
+        said = f"{kept_parts(run.parts or {})}: --resume goes on" if kept else ""
         failure = machine_failure(
             error, run.folder, said or f"Nothing of it is kept; {output.name} is as it was", output
         )

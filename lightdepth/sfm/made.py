@@ -9,8 +9,10 @@ from functools import partial
 import numpy as np
 
 from lightdepth.calibration import write_camera
+from lightdepth.counting import counted
 from lightdepth.frame import Frame, readable
 from lightdepth.reporting.kept import kept
+from lightdepth.reporting.progress import Stages
 from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
@@ -30,19 +32,14 @@ def made_sparse(
     """A map by pycolmap, written to sparse/ in the run folder; `poses` (4, 4) by frame number, where they are known,
     and `files`, the names of the frames' own.
     Of a camera that nobody calibrated, camera.json beside it says so."""
-    stages: list[str] = []
-
-    def show(stage: str, done: int, count: int) -> None:
-        if stage not in stages:
-            stages.append(stage)
-            run.log(f"sparse map: {stage}")
-
     folder, database = run.folder / "sparse", KeptDatabase(run)
-    make = partial(sparse_map_from_frames, frames, folder, config, show, poses, database, files)
-    found = kept(run, "sparse map", SfmMap, make, folder=folder)
+    with Stages("sparse map") as told:
+        make = partial(sparse_map_from_frames, frames, folder, config, told, poses, database, files)
+        found = kept(run, "sparse map", SfmMap, make, folder=folder)
     for submap in found.submaps:
         errors = number(float(np.median(submap.reprojection_errors())))
-        run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {len(submap.points)} points, {errors} px")
+        points = counted(len(submap.points), "point")
+        run.log(f"sparse map {submap.id}: {len(submap.keyframes)} keyframes, {points}, {errors} px")
     if files and any(files.get(k.number) != k.name for submap in found.submaps for k in submap.keyframes):
         run.log(f"sparse map: its images are named by number; {SOURCES} in each folder has the names of the files")
     if found.poses is not None:

@@ -24,6 +24,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, Pinhole, camera_from_params
 from lightdepth.camera.provenance import TOLERATED, told
+from lightdepth.counting import counted
 from lightdepth.errors import InputError
 from lightdepth.files.working import working_folder
 from lightdepth.frame import Frame
@@ -123,7 +124,7 @@ def self_calibrated(
     if fov is not None and not 10 <= fov <= 175:
         raise InputError("--fov", f"{fov:g} degrees", "expected the field across the image's width, from 10 to 175")
     if len(frames) < config.min_model_size:
-        found = f"{len(frames)} frame{'s' * (len(frames) != 1)}, of {config.min_model_size} that their motion needs"
+        found = f"{counted(len(frames), 'frame')}, of {config.min_model_size} that their motion needs"
         raise InputError("--camera auto", found, ADVICE_WITHOUT_CAMERA)
     with working_folder() as work:
         for part in ("images", "masks"):

@@ -9,17 +9,20 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import lightning.pytorch as pl
 from jsonargparse import ArgumentParser
 
 from lightdepth.checkpoint import load_model
+from lightdepth.command_line.outcome import is_quiet, outcome
 from lightdepth.errors import PartialFailure
 from lightdepth.files.writing import write_whole
 from lightdepth.foreign_text import for_line
 from lightdepth.models import NetworkModel
+from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import plain
 
 from ..datamodule import FrameDataModule
@@ -42,20 +45,33 @@ def finished(plan: Plan) -> Result | None:
 def train_all(parser: ArgumentParser, todo: Sequence[Plan], judge: Judge) -> None:
     started, steps = time.monotonic(), sum(plan.config.trainer.max_steps for plan in todo)
     done, seed, rendered = 0, None, list[FrameDataModule]()
-    for number, plan in enumerate(todo, 1):
-        if plan.seed != seed:
-            seed, rendered = plan.seed, []
-        result = _trained(parser, plan, judge, rendered)
-        write_whole(plan.path, json.dumps({"stamp": plan.stamp, "result": plain(result)}, indent=1) + "\n")
-        done += plan.config.trainer.max_steps
-        left = (time.monotonic() - started) / done * (steps - done) / 60
-        said = result.failed or f"{result.overall():.3f} of the closed form's errors"
-        what = f"[{number}/{len(todo)}] seed {plan.seed}, {plan.row.name}"
-        say(f"{what}: {said}, {result.seconds:.0f} s; {left:.0f} min left")
+    with Progress("Steps of training", steps) as bar:
+        for number, plan in enumerate(todo, 1):
+            if plan.seed != seed:
+                seed, rendered = plan.seed, []
+            result = _trained(parser, plan, judge, rendered, partial(_reach, bar, done))
+            write_whole(plan.path, json.dumps({"stamp": plan.stamp, "result": plain(result)}, indent=1) + "\n")
+            done += plan.config.trainer.max_steps
+            bar.reach(done)
+            left = (time.monotonic() - started) / done * (steps - done) / 60
+            said = result.failed or f"{result.overall():.3f} of the closed form's errors"
+            what = f"[{number}/{len(todo)}] seed {plan.seed}, {plan.row.name}"
+            say(f"{what}: {said}, {result.seconds:.0f} s; {left:.0f} min left")
 
 
-def _trained(parser: ArgumentParser, plan: Plan, judge: Judge, rendered: list[FrameDataModule]) -> Result:
-    """Trains one row of one seed and judges it. `rendered` has frames of this seed, and gets those that it lacks."""
+def _reach(bar: Progress, before: int, step: int) -> None:
+    bar.reach(before + step)
+
+
+def _trained(
+    parser: ArgumentParser,
+    plan: Plan,
+    judge: Judge,
+    rendered: list[FrameDataModule],
+    step: Callable[[int], None] = lambda at: None,
+) -> Result:
+    """Trains one row of one seed and judges it. `rendered` has frames of this seed, and gets those that it lacks.
+    `step` is told each step."""
     folder = Path(plan.config.output)
     pl.seed_everything(plan.seed, workers=True, verbose=False)
     made = parser.instantiate(plan.config)
@@ -63,7 +79,7 @@ def _trained(parser: ArgumentParser, plan: Plan, judge: Judge, rendered: list[Fr
     if not any(data.share(other) for other in rendered):
         data.setup()
         rendered.append(data)
-    curve, started = _Curve(), time.monotonic()
+    curve, started = _Curve(step), time.monotonic()
     options = {**vars(made.trainer), "logger": False, "callbacks": [curve], "enable_progress_bar": False}
     text = as_yaml(parser, plan.config)
     parameters = sum(p.numel() for p in made.model.network.parameters())
@@ -95,10 +111,18 @@ def _trained(parser: ArgumentParser, plan: Plan, judge: Judge, rendered: list[Fr
 
 
 class _Curve(pl.Callback):
-    """The validation loss over the steps."""
+    """The validation loss over the steps. `step` is told each step."""
 
-    def __init__(self) -> None:
+    def __init__(self, step: Callable[[int], None]) -> None:
         self.points: list[tuple[int, float]] = []
+        self._step = step
+
+    def __getstate__(self) -> dict[str, object]:
+        """For processes that are started for the training: nobody counts there."""
+        return {"points": self.points, "_step": abs}
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: object) -> None:
+        self._step(trainer.global_step)
 
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         loss = float(trainer.callback_metrics["val/loss"])
@@ -108,4 +132,6 @@ class _Curve(pl.Callback):
 
 def say(line: str) -> None:
     """A line for the terminal."""
-    print(for_line(line), file=sys.stderr, flush=True)
+    if not is_quiet():
+        print(for_line(line), file=sys.stderr, flush=True)
+    outcome().stage(line)

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from lightdepth.calibration import write_camera, write_light
+from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.datasets.with_map import open_with_map
@@ -142,7 +143,7 @@ def frame_data(
     replayed = replayed_frames(data)
     colons = f"; {replayed} frames of {config.replay} synthetic colons in half of each batch" if config.replay else ""
     learned = data.counts["train"] - replayed
-    run.log(f"{learned} frames to learn from, {data.counts['val']} held out, {size[0]}x{size[1]}{colons}")
+    run.log(f"{counted(learned, 'frame')} to learn from, {data.counts['val']} held out, {size[0]}x{size[1]}{colons}")
     return data
 
 

@@ -15,8 +15,11 @@ import re
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
+from lightdepth.command_line.outcome import end, outcome
+from lightdepth.counting import counted
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files import replacing
 from lightdepth.files.lock import locked
@@ -103,9 +106,12 @@ def ablate(
         if place != real:
             (place / replacing.BEGUN).unlink(missing_ok=True)
             replacing.replace(place, real, before)
-    say(f"table: {table or output / 'ablation.md'}")
+    outcome().made(output)
     if failed:
-        raise PartialFailure(f"{len(failed)} trainings failed, the first: {failed[0].row}: {failed[0].failed}")
+        first = f"{failed[0].row}: {failed[0].failed}"
+        raise PartialFailure(f"{counted(len(failed), 'training')} failed, the first: {first}. The rest is in {output}")
+    page = table or output / "ablation.md"
+    end(*filter(None, (output, table)), then=f"cat {quote(str(page))}", page=page)
 
 
 def _check_ours(output: Path) -> None:
@@ -136,7 +142,7 @@ def _ablate(
     check_apart(common.tube, judged, seeds)
     (output / "run.json").unlink(missing_ok=True)
     todo = [plan for plan in plans if finished(plan) is None]
-    say(f"{len(plans)} trainings, {len(plans) - len(todo)} of them already there")
+    say(f"{counted(len(plans), 'training')}, {len(plans) - len(todo)} of them already there")
     if todo:
         quiet()
         train_all(parser, todo, Judge(judged, common.tube, common.size))

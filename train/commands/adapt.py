@@ -12,11 +12,14 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
+from shlex import quote
 
 from safetensors.torch import load_file, save_file
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called, save_model
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
+from lightdepth.counting import counted
 from lightdepth.datasets import SequenceSource
 from lightdepth.detective import PairingConfig
 from lightdepth.errors import InputError
@@ -133,6 +136,9 @@ def adapt(
         made.files(run.folder, FILES)
         made.write(run.folder / "report.html")
         _record(run, start, target, module, data, config, outcome)
+    model = quote(str(output / "model.safetensors"))
+    then = f"lightdepth densify DATA --map MAP --checkpoint {model} -o runs/own"
+    end(output, then=then, page=output / "report.html")
 
 
 def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> None:
@@ -153,7 +159,7 @@ def _card(
     start: NetworkModel, module: Adaptation, data: FrameDataModule, config: AdaptConfig, outcome: Outcome
 ) -> AdaptedCard:
     learned = data.counts["train"] - replayed_frames(data)
-    said = f"{len(data.sequences)} sequence(s), {learned} frames, {data.size[0]}x{data.size[1]}"
+    said = f"{counted(len(data.sequences), 'sequence')}, {counted(learned, 'frame')}, {data.size[0]}x{data.size[1]}"
     return AdaptedCard(
         trained_on=f"{start.card.get('trained_on', start.name)} Adapted without truth to {said}",
         adapted_from=start.name,

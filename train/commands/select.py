@@ -13,18 +13,20 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from lightdepth.command_line.options import Group
+from lightdepth.command_line.outcome import end
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.coloured import colours_of
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.errors import AlreadyFinished, InputError
 from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import Content, write_together
-from lightdepth.foreign_text import for_line, for_table
+from lightdepth.foreign_text import for_table
 from lightdepth.image_quality import RepeatFinder
 from lightdepth.maps.convention import MapReading
 from lightdepth.ranges import Range, checked
@@ -167,7 +169,12 @@ def select(
         write_together(writers)
         if no_frames:
             paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
-    print(f"{summary}\n{for_line(', '.join(str(path) for path in writers))}")
+    print(summary)
+    place = quote(str(output))
+    then = f"lightdepth train --preset lightdepth -o runs/self --data.sequences '[DATA]' --data.frames {place}"
+    result = {"frames": len(verdicts), "kept": len(chosen), "rejected": dict(_rejected(verdicts))}
+    beside = [path for path in writers if path != output]
+    end(output, *beside, then=then, page=paths["page"], result=result, doubts=doubts)
 
 
 @dataclass(frozen=True)
@@ -273,8 +280,11 @@ def _by_map(
 
 
 def _counts(verdicts: Sequence[FrameVerdict]) -> str:
-    counts = Counter(v.reason for v in verdicts if not v.kept)
-    return ", ".join(f"{count} {reason}" for reason, count in counts.most_common()) or "none"
+    return ", ".join(f"{count} {reason}" for reason, count in _rejected(verdicts).most_common()) or "none"
+
+
+def _rejected(verdicts: Sequence[FrameVerdict]) -> Counter[str]:
+    return Counter(v.reason for v in verdicts if not v.kept)
 
 
 def _table(verdicts: Sequence[FrameVerdict]) -> str:

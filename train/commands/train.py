@@ -7,12 +7,14 @@ from dataclasses import asdict
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from shlex import quote
 
 import lightning.pytorch as pl
 
 from lightdepth.command_line.gone_settings import without_gone
 from lightdepth.command_line.mistakes import fail
-from lightdepth.command_line.parsing import parsed
+from lightdepth.command_line.outcome import end, outcome
+from lightdepth.command_line.parsing import Parser, parsed
 from lightdepth.command_line.presets import with_preset
 from lightdepth.reporting.names import KEPT
 from lightdepth.reporting.own_settings import with_real_settings
@@ -20,7 +22,7 @@ from lightdepth.reporting.same import paths_in
 
 from ..datamodule import FrameDataModule
 from ..fit import fit
-from ..folder import check_output
+from ..folder import check_output, first_process
 from ..parser import as_yaml, training_parser
 
 
@@ -31,6 +33,8 @@ def train(argv: list[str] | None = None) -> int:
     Lightning's Trainer is a dotted override. `--resume` without --preset and --config takes the run's config.yaml.
     """
     given = list(sys.argv[1:] if argv is None else argv)
+    if not first_process():
+        outcome().json = False  # the first one prints the document of all
     parser = training_parser()
     argv = without_gone(
         "train", with_real_settings(_with_own_config(with_preset("train", given, partial(fail, parser))))
@@ -47,7 +51,16 @@ def train(argv: list[str] | None = None) -> int:
     flags = {"resume": config.resume, "overwrite": config.overwrite, "arguments": given, "settings": made.fit}
     flags["inputs"] = inputs
     fit(made.model, FrameDataModule(made.data), output, asdict(made.trainer), text, config.seed, **flags)
+    if first_process():
+        outcome().made(output)
+        then = f"lightdepth densify DATA --map MAP --checkpoint {quote(str(output / 'model.safetensors'))} -o runs/own"
+        end(output, then=then, page=output / "model.md")
     return 0
+
+
+def parsers() -> dict[str, Parser]:
+    """What the command line of train is."""
+    return {"": training_parser()}
 
 
 def _with_own_config(argv: list[str]) -> list[str]:

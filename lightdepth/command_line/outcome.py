@@ -1,0 +1,261 @@
+"""What came of a verb, and how much of it is said: its last lines, `--quiet`, and `--json`, one document instead.
+
+    verb, at its end:  end(output, then="lightdepth evaluate OUT --truth SEQUENCE", page=output / "report.html")
+    usually:           next: lightdepth evaluate OUT --truth SEQUENCE
+                       written: OUT; open OUT/report.html
+
+Words of every verb, which are taken off the command line before its own options are read. `--quiet` leaves errors,
+warnings, the answer of a verb that writes nothing, and the line of what was written. `--json` leaves standard output to
+the document, which comes last; all that is said besides goes to standard error.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+from lightdepth.command_line.heartbeat import Heartbeat, beating
+from lightdepth.errors import Interrupted, WrongUsage
+from lightdepth.foreign_text import for_line, for_terminal
+
+QUIET, JSON = "--quiet", "--json"
+SAID_OF = {
+    "quiet": "Say nothing but errors, warnings, and what was written where; log.txt has all of it.",
+    "json": "Print what came of it as one JSON document, and nothing else, on standard output.",
+}
+"""The words that every verb takes, with their sentences for the help."""
+_ANSWERED = ("-h", "--help", "--help_all", "--print_config", "-V", "--version")
+"""Words that are answered by a text of their own, in the place of any work."""
+_LISTED = ("files", "warnings", "failures")
+"""What the document has beside the rest of run.json."""
+
+
+@dataclass
+class Outcome:
+    """What came of one call of the command."""
+
+    quiet: bool = False
+    json: bool = False
+    verb: str = ""
+    version: str = ""
+    """of the program"""
+    out: TextIO | None = None
+    """where the last lines and the document go"""
+    output: str | None = None
+    files: list[str] = field(default_factory=list)
+    then: str = ""
+    result: Mapping[str, Any] | None = None
+    warnings: list[str] = field(default_factory=list)
+    failures: list[Any] = field(default_factory=list)
+    error: dict[str, str] | None = None
+    finished_before: bool = False
+    stage: Callable[[str], None] = lambda said: None
+    """is told the lines of a log"""
+    record: Mapping[str, Any] | None = None
+    """the last run.json that was written, of a folder that may not be in its place yet"""
+
+    @property
+    def doubts(self) -> TextIO | None:
+        """Where warnings go: to standard output, or, where nothing is said there, to standard error."""
+        return sys.stderr if self.quiet else None
+
+    def fail(self, where: object, found: object, cure: str = "") -> None:
+        """The call ends with an error."""
+        self.error = {"where": str(where), "found": str(found), "cure": cure}
+
+    def made(self, output: Path, said: Sequence[str] = ()) -> None:
+        """The run folder whose run.json was written last is in its place. `said`: its warnings, as they were told."""
+        record = self.record or {}
+        self.output = str(output)
+        self.files = [str(output / name) for name in (*record.get("files", {}), "run.json")]
+        self.result = {name: value for name, value in record.items() if name not in _LISTED}
+        self.warnings = [*record.get("warnings", []), *(w for w in self.warnings if w not in said)]
+        self.failures = list(record.get("failures", []))
+
+    def warned(self, message: str) -> None:
+        """Something is doubtful."""
+        if message not in self.warnings:
+            self.warnings.append(message)
+
+    def last(self, line: str) -> None:
+        """A line that is said with `--quiet` too."""
+        print(for_terminal(line), file=self.out if self.quiet and not self.json else None, flush=True)
+
+    def answer(self, text: str) -> None:
+        """What somebody reads who is no terminal: a text as it is."""
+        print(text, file=self.out if self.quiet and not self.json else None, flush=True)
+
+    def document(self, code: int, seconds: float) -> str:
+        """All of it, as --json prints it."""
+        said: dict[str, Any] = {"verb": self.verb, "exit_code": code, "version": self.version}
+        said |= {"output": self.output, "files": self.files, "next": self.then, "result": self.result}
+        said |= {"warnings": self.warnings, "failures": self.failures, "seconds": round(seconds, 3)}
+        if self.finished_before:
+            said["finished_before"] = True
+        if self.error is not None:
+            said["error"] = self.error
+        return json.dumps(_plain(said), indent=1)
+
+
+OUTCOME: ContextVar[Outcome] = ContextVar("outcome")
+_NOBODY = Outcome()
+"""Of functions that are called from Python: what is noted in it is read by nobody."""
+
+
+def outcome() -> Outcome:
+    """That of the call which is at work."""
+    return OUTCOME.get(_NOBODY)
+
+
+def is_quiet() -> bool:
+    """Whether nothing is to be said of how the work goes."""
+    return outcome().quiet
+
+
+def end(
+    *written: Path,
+    then: str,
+    page: Path | None = None,
+    result: Mapping[str, Any] | None = None,
+    doubts: Sequence[str] = (),
+) -> None:
+    """The last lines of a verb: what to type next, and what was written where, as the user named it. `page` is what to
+    open first; `result` and `doubts` are of a verb without a run folder."""
+    call = outcome()
+    call.then = then
+    if written and call.output is None:
+        call.output, call.files = str(written[0]), [str(path) for path in written]
+    if result is not None:
+        call.result = result
+    for doubt in doubts:
+        call.warned(doubt)
+    if not call.quiet:
+        print(f"next: {for_line(then)}", flush=True)
+    opened = f"; open {for_line(str(page))}" if page is not None else ""
+    if written:
+        call.last(f"written: {', '.join(for_line(str(path)) for path in written)}{opened}")
+    elif not call.quiet:
+        call.last("written: nothing")
+
+
+def manners(words: Sequence[str]) -> tuple[Outcome, list[str]]:
+    """How a command line wants to be answered, and its words without those that say so."""
+    asked = any(word.replace("-", "_").partition("=")[0] in _SPELLED for word in words)
+    rest = [word for word in words if word not in (QUIET, JSON)]
+    return Outcome(QUIET in words, JSON in words and not asked, rest[0] if rest else ""), rest
+
+
+_SPELLED = {word.replace("-", "_") for word in _ANSWERED}
+
+
+@contextmanager
+def speaking(call: Outcome) -> Iterator[list[int]]:
+    """Within it `call` is what verbs tell of. The exit code is put into what is yielded; the document, where one is
+    wanted, is printed at the end, whatever the block raises."""
+    code, start, token = [1], time.monotonic(), OUTCOME.set(call)
+    call.out = sys.stdout
+    try:
+        with _heard(call), _streams(call), _beating(call):
+            yield code
+    except SystemExit as stop:
+        code[:] = [stop.code if isinstance(stop.code, int) else int(stop.code is not None)]
+        if isinstance(stop, WrongUsage):
+            call.fail("the command line", stop.found, stop.cure)
+        raise
+    except Interrupted as error:
+        code[:] = [128 + error.signal]
+        stopped, _, kept = str(error).partition("; ")
+        call.fail(call.verb, stopped, kept)
+        raise
+    except BaseException as error:
+        call.fail(call.verb, f"{type(error).__name__}: {error}", "this is a fault of the program: please report it")
+        raise
+    finally:
+        OUTCOME.reset(token)
+        if call.json:
+            print(call.document(code[0], time.monotonic() - start), file=call.out, flush=True)
+
+
+@contextmanager
+def _heard(call: Outcome) -> Iterator[None]:
+    """What is warned of meanwhile is noted."""
+    shown = warnings.showwarning
+
+    def heard(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        shown(message, category, filename, lineno, file, line)
+        if issubclass(category, UserWarning):
+            call.warned(str(message))
+
+    warnings.showwarning = heard
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown
+
+
+@contextmanager
+def _streams(call: Outcome) -> Iterator[None]:
+    """Standard output is kept for what it is wanted for: nothing else comes there, from libraries neither."""
+    if not (call.quiet or call.json):
+        yield
+        return
+    out = sys.stdout
+    with suppress(OSError):
+        out.flush()
+    with ExitStack() as ending:
+        if call.json:
+            number = os.dup(1)
+            os.dup2(2, 1)
+            ending.callback(os.close, number)
+            ending.callback(os.dup2, number, 1)
+            sys.stdout = sys.stderr
+        if call.quiet:
+            sys.stdout = ending.enter_context(open(os.devnull, "w", encoding="utf-8"))
+        try:
+            yield
+        finally:
+            sys.stdout = out
+
+
+@contextmanager
+def _beating(call: Outcome) -> Iterator[None]:
+    """No long silence, unless silence was asked for."""
+    if call.quiet or not call.verb:
+        yield
+        return
+    start, out, err = time.monotonic(), sys.stdout, sys.stderr
+    heart = Heartbeat(
+        f"lightdepth {call.verb}",
+        lambda: max(getattr(stream, "heard", start) for stream in (out, err)),
+        lambda line: print(for_line(line), file=err, flush=True),
+    )
+    call.stage = heart.stage
+    with beating(heart):
+        yield
+
+
+def _plain(value: Any) -> Any:
+    """For JSON of any reader: paths as text, and no number that is none."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, float):
+        return value if abs(value) < float("inf") else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
