@@ -254,6 +254,10 @@ MORE = [
     Command(f"bench completion {OUT} --external [mine]", words="NAME=FOLDER"),
     Command(f"bench completion {OUT} --external [mine=HERE/nowhere]", words="nowhere"),
     Command(f"bench completion {OUT} --external [ours=HERE/others]", words="another name"),
+    # ---- completion
+    Command("completion", 2, "missing: SHELL"),
+    Command("completion tcsh", 2, "expected one of bash, zsh, fish"),
+    Command("completion bash more", 2, "more: nothing takes this word"),
     # ---- places for the output
     Command(f"predict {DATA} {DECLINE} -o HERE/file", words="file"),
     Command(f"predict {DATA} {DECLINE} -o HERE/others", words="others"),

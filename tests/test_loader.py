@@ -122,5 +122,5 @@ def test_a_worker_that_is_killed_is_told_as_the_machine_s_doing_and_the_others_e
     with pytest.raises(RuntimeError) as raised:
         read(killed, 2)
     failure = machine_failure(raised.value, tmp_path, "Its checkpoints are kept: --resume goes on")
-    assert failure is not None and "--data.num_workers 0" in str(failure) and str(failure).endswith("--resume goes on")
+    assert failure is not None and "--data.num-workers 0" in str(failure) and str(failure).endswith("--resume goes on")
     assert not multiprocessing.active_children()

@@ -213,7 +213,9 @@ def test_a_stated_field_is_kept_where_the_motion_hardly_tells_it_and_does_not_sp
 @pytest.mark.parametrize(("deviation", "source"), [(1.0, "assumed"), (0.1, "self-calibrated")])
 def test_the_camera_of_a_worthless_estimate_is_the_stated_one_and_it_is_said(deviation, source, tmp_path, monkeypatch):
     data = written(tmp_path / "data", box_film(across(60, 50, 90), 4))
-    monkeypatch.setattr("lightdepth.uncalibrated.self_calibrated", lambda frames, config, fov: guessed(deviation, fov))
+    monkeypatch.setattr(
+        "lightdepth.uncalibrated.self_calibrated", lambda frames, config, told, fov: guessed(deviation, fov)
+    )
     with run_folder(tmp_path / "run", "predict", {}) as run:
         camera = found_camera(SequenceSource(data, fov=110.0), run)
     assert isinstance(camera, Pinhole) and camera.provenance is not None and camera.provenance.source == source
@@ -228,7 +230,7 @@ def test_the_camera_of_a_worthless_estimate_is_the_stated_one_and_it_is_said(dev
 
 def test_a_resumed_run_has_the_camera_that_was_found_with_its_doubt(tmp_path, monkeypatch):
     source = SequenceSource(written(tmp_path / "data", box_film(across(60, 50, 90), 4)), camera=Path("auto"))
-    monkeypatch.setattr("lightdepth.uncalibrated.self_calibrated", lambda frames, config, fov: guessed(0.1, fov))
+    monkeypatch.setattr("lightdepth.uncalibrated.self_calibrated", lambda frames, config, told, fov: guessed(0.1, fov))
     with pytest.raises(KeyboardInterrupt), run_folder(tmp_path / "run", "predict", {}, resume=False) as run:
         run.hash_inputs(data=source.data)
         first = read_camera(with_camera(source, run).files["camera"])

@@ -43,7 +43,7 @@ _WORDS = {"database or disk is full": errno.ENOSPC, "disk I/O error": errno.EIO}
 _KILLED = re.compile(r"DataLoader worker .*(is killed by signal|exited unexpectedly)")
 _A_WORKER = (
     "a process that reads frames was killed, as the system does where memory runs out (fewer processes, as by "
-    "--data.num_workers 0, need less)"
+    "--data.num-workers 0, need less)"
 )
 _MEMORY = ("can't allocate memory", "out of memory", "Insufficient memory", "Cannot allocate memory", "bad_alloc")
 
