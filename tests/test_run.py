@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import sys
 import time
 import warnings
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import pytest
 import yaml
 from raising import refused
 
-from lightdepth.errors import InputError, PartialFailure
+from lightdepth.errors import AlreadyFinished, InputError, PartialFailure
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.record import git_revision, versions, write_run_json
 from lightdepth.reporting.run import input_hash, plain, run_folder
@@ -98,6 +99,26 @@ def test_a_run_does_not_replace_what_it_reads(tmp_path):
         with refused(where="out", cure="choose another -o"), run_folder(tmp_path / "out", "export", given, True):
             pass
     assert (tmp_path / "out" / "result.txt").read_text() == "old"
+
+
+def test_a_whole_run_that_was_killed_before_it_took_the_place_of_an_older_one_takes_it_by_resume(tmp_path, monkeypatch):
+    output = tmp_path / "out"
+
+    def make_of(size: int, **given) -> None:
+        with run_folder(output, "densify", {"size": size}, **given) as run:
+            (run.folder / "result.txt").write_text(f"{size}")
+
+    make_of(1, resume=False)
+    with monkeypatch.context() as killed:
+        killed.setattr("lightdepth.reporting.run.replace", lambda *_: sys.exit("killed"))
+        with pytest.raises(SystemExit):
+            make_of(2, resume=False, overwrite=True)
+    with refused(found="--size was 1 and is 3"):
+        make_of(3, resume=True)
+    assert (output / "result.txt").read_text() == "1" and beside(output) == [".out.unfinished", "out"]
+    with pytest.raises(AlreadyFinished, match="killed at its last step"):
+        make_of(2, resume=True)
+    assert (output / "result.txt").read_text() == "2" and beside(output) == ["out"]
 
 
 def test_an_empty_folder_is_filled_and_a_file_is_no_folder(tmp_path):

@@ -16,8 +16,10 @@ from raising import refused
 from training import TINY_RUN
 
 from lightdepth.cli import main
-from lightdepth.files.writing import write_whole
+from lightdepth.files.writing import PARTIAL, our_mark, write_whole
+from lightdepth.reporting.unfinished import begin
 from train.commands.train import train
+from train.folder import check_output
 
 
 @contextmanager
@@ -73,6 +75,18 @@ def test_a_disk_that_is_full_costs_neither_the_old_result_nor_the_last_checkpoin
         assert main(["train", "-o", str(run), "--resume", "--trainer.max_steps", "4"]) == 5
     assert "--resume goes on" in capsys.readouterr().err.splitlines()[-1]
     assert train(["-o", str(run), "--resume", "--trainer.max_steps", "4"]) == 0
+
+
+def test_what_a_killed_training_was_writing_does_not_keep_the_next_one_from_starting_anew(finished_run, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished_run, run)
+    check_output(run, resume=False, overwrite=True)
+    (run / "run.json").rename(run / f"{PARTIAL}{our_mark()}run.json")  # killed before it was renamed
+    begin(run, {"verb": "train", "arguments": {}})
+    check_output(run, resume=False, overwrite=True)
+    (run / "notes.txt").write_text("mine")
+    with refused("notes.txt in it is not of a run"):
+        check_output(run, resume=False, overwrite=True)
 
 
 def test_a_folder_of_another_program_is_not_gone_on_with_for_a_file_of_the_name_of_ours(tmp_path):

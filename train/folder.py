@@ -32,6 +32,7 @@ from lightdepth.files.replacing import (
     stamp,
     unfinished_path,
 )
+from lightdepth.files.writing import PARTIAL
 from lightdepth.reporting.unfinished import begin, begun_with
 
 from .checkpoints import BEST, LAST, PREVIOUS
@@ -70,7 +71,8 @@ def check_output(output: Path, resume: bool, overwrite: bool, inputs: Iterable[P
             check_apart(output, inputs)
             if complete or not begun:
                 check_replaceable(output, "train")
-            strangers = sorted({path.name for path in output.iterdir()} - {*_OURS, RECORD, BEGUN})
+            there = {path.name for path in output.iterdir() if not path.name.startswith(PARTIAL)}
+            strangers = sorted(there - {*_OURS, RECORD, BEGUN})
             if strangers and not complete:
                 found = f"not overwritten, {strangers[0]} in it is not of a run"
                 raise InputError(output, found, "move it elsewhere, or choose another -o")

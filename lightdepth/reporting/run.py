@@ -27,6 +27,7 @@ from lightdepth.files.replacing import (
     check_replaceable,
     clear_notes,
     discard,
+    read_record,
     real_output,
     recover,
     replace,
@@ -38,7 +39,7 @@ from lightdepth.files.writing import folders_for, sync_below, usual_mode
 from lightdepth.foreign_text import for_line, for_terminal
 from lightdepth.reporting.names import KEPT, Names, names_of, spoken
 from lightdepth.reporting.record import write_run_json
-from lightdepth.reporting.same import check_finished, check_same, compared, fingerprint, own_version
+from lightdepth.reporting.same import check_finished, check_same, compared, fingerprint, own_version, put_finished
 from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
 from lightdepth.reporting.same import plain as plain
@@ -317,6 +318,8 @@ def _checked(
     made = unfinished_path(output)
     begun, parts = begun_with(made), finished_parts(made)
     if output.is_dir() and any(output.iterdir()):
+        if resume and read_record(made) is not None:
+            put_finished(made, output, verb, arguments, inputs)
         if overwrite or (resume and begun is not None and parts):  # what goes on may have been begun by --overwrite
             check_apart(output, inputs)
             check_replaceable(output, verb)
