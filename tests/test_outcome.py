@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import ctypes
 import json
 import os
 import shutil
@@ -21,7 +22,7 @@ from lightdepth.command_line.presets import presets
 from lightdepth.command_line.verbs import all_verbs
 from lightdepth.commands import completion
 from lightdepth.counting import counted
-from lightdepth.errors import Interrupted, PartialFailure
+from lightdepth.errors import InputError, Interrupted, PartialFailure
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import run_folder
 
@@ -189,6 +190,36 @@ def test_both_words_may_stand_anywhere_and_help_is_help(capfd):
     assert not manners(["predict", "--json", "--help"])[0].json and not manners(["--json", "--print-config"])[0].json
     assert call("convert-camera", "--json", "--help") == 0
     assert capfd.readouterr().out.startswith("usage: lightdepth convert-camera")
+
+
+@pytest.mark.filterwarnings("ignore")  # jsonargparse takes beginnings of options, and will not for long
+def test_quiet_help_is_help_and_half_a_word_is_none(capfd):
+    for words in (["--help", "--quiet"], ["--quiet"], ["-V", "--quiet"], ["convert-camera", "--help", "--quiet"]):
+        call(*words)
+        assert capfd.readouterr().out.strip()
+    assert call("convert-camera", "x", "-o", "y", "--jso") == 2
+    assert "--json: has to be written in full" in capfd.readouterr().err
+
+
+def test_what_libraries_in_c_hold_back_is_said_before_the_document(capfd):
+    with speaking(Outcome(json=True, verb="predict")):
+        ctypes.CDLL(None).printf(b"held back\n")
+    said = capfd.readouterr()
+    assert json.loads(said.out)["verb"] == "predict" and "held back" in said.err
+
+
+def test_a_run_that_fails_tells_its_warnings_as_the_terminal_does(tmp_path, capfd):
+    data = tmp_path / "Smith_Anna"
+    data.mkdir()
+    with (
+        speaking(Outcome(json=True, verb="predict")),
+        pytest.raises(InputError),
+        run_folder(tmp_path / "out", "predict", {"data": data}) as run,
+    ):
+        run.warn(f"{data}/mask.png: is odd")
+        raise InputError("the data", "nothing of it", "give more")
+    said = capfd.readouterr()
+    assert "data/mask.png: is odd" in said.err and json.loads(said.out)["warnings"] == ["data/mask.png: is odd"]
 
 
 def test_a_file_of_settings_does_not_make_a_run_quiet(tmp_path, camera, capfd):

@@ -11,6 +11,7 @@ the document, which comes last; all that is said besides goes to standard error.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import sys
@@ -151,7 +152,8 @@ def manners(words: Sequence[str]) -> tuple[Outcome, list[str]]:
     """How a command line wants to be answered, and its words without those that say so."""
     asked = any(word.replace("-", "_").partition("=")[0] in _SPELLED for word in words)
     rest = [word for word in words if word not in (QUIET, JSON)]
-    return Outcome(QUIET in words, JSON in words and not asked, rest[0] if rest else ""), rest
+    working = bool(rest) and not asked  # help, version and the configuration are what was asked for, whatever the words
+    return Outcome(QUIET in words and working, JSON in words and not asked, rest[0] if rest else ""), rest
 
 
 _SPELLED = {word.replace("-", "_") for word in _ANSWERED}
@@ -224,6 +226,7 @@ def _streams(call: Outcome) -> Iterator[None]:
             os.dup2(2, 1)
             ending.callback(os.close, number)
             ending.callback(os.dup2, number, 1)
+            ending.callback(_flush_libraries)
             sys.stdout = sys.stderr
         if call.quiet:
             sys.stdout = ending.enter_context(open(os.devnull, "w", encoding="utf-8"))
@@ -231,6 +234,12 @@ def _streams(call: Outcome) -> Iterator[None]:
             yield
         finally:
             sys.stdout = out
+
+
+def _flush_libraries() -> None:
+    """What libraries in C have said and hold back still goes where standard output leads now."""
+    with suppress(OSError, AttributeError, TypeError):  # there is no such library everywhere
+        ctypes.CDLL(None).fflush(None)
 
 
 @contextmanager

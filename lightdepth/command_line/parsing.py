@@ -127,11 +127,21 @@ class Parser(ArgumentParser):
         return super()._check_value_key(action, value, key, *rest, **more)
 
 
+class _InFull(argparse.Action):
+    """A word that is taken before the options are read: what comes here is the beginning of it, which is not."""
+
+    def __init__(self, option_strings: list[str], dest: str, **given: Any) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=False, help=given.get("help"))
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        raise argparse.ArgumentError(self, "has to be written in full")
+
+
 def finish(parser: Parser, page: Page, ranges: Mapping[str, Range]) -> None:
     """Gives a parser that has all its options its page and their ranges, and the library's own options our words."""
     parser.page = page
     for name, text in SAID_OF.items():  # taken before options are read (outcome.manners); here for help and mistakes
-        parser.add_argument(f"--{name}", action="store_true", help=text)
+        parser.add_argument(f"--{name}", action=_InFull, help=text)
     set_ranges(parser._actions, ranges)
     plain = [a for a in options(parser) if "." not in a.dest]
     order = sorted(plain, key=lambda a: (bool(a.option_strings), a.dest != "output", a.dest in _LAST))

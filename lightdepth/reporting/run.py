@@ -77,6 +77,7 @@ class Run:
         self._arguments = plain(arguments)
         self.keep_names = False
         self._say: Callable[[str], str] | None = None
+        self._warned: list[str] = []  # as they were told
         self._named = Names()
         self.unlisted: Mapping[str, Any] = {}  # inputs that do not stand among the arguments
 
@@ -148,8 +149,10 @@ class Run:
     def warn(self, message: str) -> None:
         """Something is doubtful; the work goes on. It is in the log and in run.json."""
         self.record["warnings"].append(message)
-        outcome().warned(message)
         self._tell(f"warning: {message}", for_line, outcome().doubts)
+        assert self._say is not None  # _tell has made it
+        self._warned.append(self._say(message))
+        outcome().warned(self._warned[-1])
 
     def warn_once(self, message: str) -> None:
         """As warn, unless that was said before."""
@@ -286,7 +289,7 @@ def run_folder(
                 received = ending.enter_context(finishing_first())  # a signal waits until the result is in its place
                 run.finish()
             replace(run.folder, real, before)
-            outcome().made(output, run.record["warnings"])
+            outcome().made(output, [*run.record["warnings"], *run._warned])
             received.stop(f"it was at its last step, and {real.name} is whole")
     except OSError as error:
         failure = machine_failure(error, place=real)

@@ -199,7 +199,8 @@ def thinned(vertices: np.ndarray, triangles: np.ndarray, most: int) -> tuple[np.
     middle = vertices.mean(0)
     coarse, corners = vertices - middle, triangles
     if len(triangles) > _ROUGHLY * most:
-        coarse, corners = _clustered(coarse, corners, _ROUGHLY // 2 * most)
+        clustered = _clustered(coarse, corners, _ROUGHLY // 2 * most)
+        coarse, corners = clustered if len(clustered[1]) else (coarse, corners)  # one far vertex makes one cell of all
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(coarse), o3d.utility.Vector3iVector(corners.astype(np.int32))
     ).simplify_quadric_decimation(most)
