@@ -19,7 +19,7 @@ from lightdepth.cli import main
 from lightdepth.files.writing import PARTIAL, our_mark, write_whole
 from lightdepth.reporting.unfinished import begin
 from train.commands.train import train
-from train.folder import check_output
+from train.folder import check_output, training_folder
 
 
 @contextmanager
@@ -83,7 +83,11 @@ def test_what_a_killed_training_was_writing_does_not_keep_the_next_one_from_star
     check_output(run, resume=False, overwrite=True)
     (run / "run.json").rename(run / f"{PARTIAL}{our_mark()}run.json")  # killed before it was renamed
     begin(run, {"verb": "train", "arguments": {}})
-    check_output(run, resume=False, overwrite=True)
+    with training_folder(run, resume=False, overwrite=True) as folder:
+        shutil.copytree(finished_run, folder)
+    assert os.listdir(tmp_path) == ["run"] and contents(run) == contents(finished_run)
+    (run / "run.json").unlink()
+    begin(run, {"verb": "train", "arguments": {}})
     (run / "notes.txt").write_text("mine")
     with refused("notes.txt in it is not of a run"):
         check_output(run, resume=False, overwrite=True)

@@ -179,9 +179,8 @@ def _put(made: Path, output: Path) -> None:
 
 
 def _clear(folder: Path) -> None:
-    """Removes what a run wrote, and no other file."""
-    for name in (*_OURS, BEGUN):
-        path = folder / name
+    """Removes what a run wrote, and what it was writing when it was killed, and no other file."""
+    for path in [*(folder / name for name in (*_OURS, BEGUN)), *folder.glob(f"{PARTIAL}*")]:
         if path.is_dir():
             shutil.rmtree(path)
         else:
