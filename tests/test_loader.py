@@ -119,7 +119,7 @@ def test_a_folder_that_is_gone_is_the_machine_s_doing(tmp_path, workers):
 
 def test_a_worker_that_is_killed_is_told_as_the_machine_s_doing_and_the_others_end(tmp_path):
     killed = Frames(tmp_path, 6, lambda i: os.kill(os.getpid(), signal.SIGKILL) if i == 2 else None)
-    with pytest.raises(RuntimeError) as raised:
+    with pytest.raises(MachineFailure) as raised:
         read(killed, 2)
     failure = machine_failure(raised.value, tmp_path, "Its checkpoints are kept: --resume goes on")
     assert failure is not None and "--data.num-workers 0" in str(failure) and str(failure).endswith("--resume goes on")

@@ -16,6 +16,10 @@ from lightdepth.photometry import LightTerms
 from train.order import Shuffled
 
 _GRACE_S = 120.0
+_KILLED = (
+    "a process that reads frames was killed, as the system does where memory runs out (fewer processes, as by "
+    "--data.num-workers 0, need less)"
+)
 _MOST_UNREAD = 20  # items one after another: no accident, but a mistake
 
 
@@ -128,7 +132,7 @@ class _Loader(DataLoader[FrameBatch]):
         except RuntimeError as error:
             if "DataLoader worker" not in str(error):
                 raise
-            failed = RuntimeError(str(error))  # killed; without tracebacks, also those of its causes
+            failed = MachineFailure(_KILLED)
         if failed is None and (read or unreadable is None):
             return
         # Workers end with the iterator that holds them, at once: with a traceback it would be in a cycle, whose

@@ -16,7 +16,6 @@ import json
 import os
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
@@ -25,6 +24,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from lightdepth.command_line.heartbeat import Heartbeat, beating
+from lightdepth.command_line.warned import heard
 from lightdepth.errors import Interrupted, WrongUsage
 from lightdepth.foreign_text import for_line, for_terminal
 
@@ -166,7 +166,7 @@ def speaking(call: Outcome) -> Iterator[list[int]]:
     code, start, token = [1], time.monotonic(), OUTCOME.set(call)
     call.out = sys.stdout
     try:
-        with _heard(call), _streams(call), _beating(call):
+        with heard(call.warned), _streams(call), _beating(call):
             yield code
     except SystemExit as stop:
         code[:] = [stop.code if isinstance(stop.code, int) else int(stop.code is not None)]
@@ -185,30 +185,6 @@ def speaking(call: Outcome) -> Iterator[list[int]]:
         OUTCOME.reset(token)
         if call.json:
             print(call.document(code[0], time.monotonic() - start), file=call.out, flush=True)
-
-
-@contextmanager
-def _heard(call: Outcome) -> Iterator[None]:
-    """What is warned of meanwhile is noted."""
-    shown = warnings.showwarning
-
-    def heard(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
-        shown(message, category, filename, lineno, file, line)
-        if issubclass(category, UserWarning):
-            call.warned(str(message))
-
-    warnings.showwarning = heard
-    try:
-        yield
-    finally:
-        warnings.showwarning = shown
 
 
 @contextmanager

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TextIO
 
 from lightdepth.foreign_text import for_terminal
 
@@ -27,3 +28,31 @@ def warnings_as_sentences() -> Iterator[None]:
         yield
     finally:
         warnings.formatwarning = as_python
+
+
+@contextmanager
+def heard(take: Callable[[str], None], known: Callable[[str], bool] = lambda said: False) -> Iterator[None]:
+    """Within it `take` is told what each UserWarning says, after it was shown; one that is `known` is passed over. A
+    library's deprecations are no news to a user."""
+    shown = warnings.showwarning
+
+    def hear(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        ours = issubclass(category, UserWarning)
+        if ours and known(str(message)):
+            return
+        shown(message, category, filename, lineno, file, line)
+        if ours:
+            take(str(message))
+
+    warnings.showwarning = hear
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown

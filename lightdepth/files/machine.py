@@ -40,11 +40,6 @@ _NUMBER = re.compile(r"\(os error (\d+)\)")
 _WORDS = {"database or disk is full": errno.ENOSPC, "disk I/O error": errno.EIO}
 """What SQLite says instead of a number, in errors of sqlite3 and of those who use it."""
 
-_KILLED = re.compile(r"DataLoader worker .*(is killed by signal|exited unexpectedly)")
-_A_WORKER = (
-    "a process that reads frames was killed, as the system does where memory runs out (fewer processes, as by "
-    "--data.num-workers 0, need less)"
-)
 _MEMORY = ("can't allocate memory", "out of memory", "Insufficient memory", "Cannot allocate memory", "bad_alloc")
 
 
@@ -61,7 +56,7 @@ def machine_failure(
         return None
     named = getattr(error, "filename", None)
     named = None if isinstance(named, int) else named  # a descriptor says nothing to a reader
-    if reason in (FAILS[errno.ENOMEM], _A_WORKER):
+    if reason == FAILS[errno.ENOMEM]:
         return MachineFailure(". ".join(filter(None, (reason, kept))))
     where = Path(os.fsdecode(named)) if named is not None else folder or place
     if where is None:
@@ -85,8 +80,6 @@ def _reason(error: BaseException, folder: Path | None) -> str | None:
         isinstance(error, RuntimeError) and any(sign in str(error) for sign in _MEMORY)
     ):
         return FAILS[errno.ENOMEM]
-    if isinstance(error, RuntimeError) and _KILLED.search(str(error)):
-        return _A_WORKER
     if isinstance(error, FileNotFoundError) and is_lost():
         return "the folder that you are in is gone"
     if isinstance(error, OSError) and error.errno in FAILS:

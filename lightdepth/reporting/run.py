@@ -9,13 +9,13 @@ from __future__ import annotations
 import stat
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
 from lightdepth.command_line.outcome import outcome
+from lightdepth.command_line.warned import heard
 from lightdepth.counting import counted
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.lock import locked
@@ -39,7 +39,7 @@ from lightdepth.files.writing import folders_for, sync_below, usual_mode
 from lightdepth.foreign_text import for_line, for_terminal
 from lightdepth.reporting.names import KEPT, Names, names_of, spoken
 from lightdepth.reporting.record import write_run_json
-from lightdepth.reporting.same import check_finished, check_same, compared, fingerprint, own_version, put_finished
+from lightdepth.reporting.same import check_finished, check_same, compared, fingerprint, own_version
 from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
 from lightdepth.reporting.same import plain as plain
@@ -51,6 +51,7 @@ from lightdepth.reporting.unfinished import (
     clean,
     finished_parts,
     new_files,
+    put_finished,
 )
 from lightdepth.signals import finishing_first
 
@@ -193,30 +194,13 @@ class Run:
     @contextmanager
     def hearing(self) -> Iterator[None]:
         """What is warned of meanwhile, by whom ever, is in log.txt and run.json too."""
-        shown = warnings.showwarning
 
-        def heard(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
-            # A library's deprecations are no news to a user; what a process that was killed heard is heard again.
-            ours = issubclass(category, UserWarning)
-            if ours and str(message) in self.record["warnings"]:
-                return
-            shown(message, category, filename, lineno, file, line)
-            if ours:
-                self.record["warnings"].append(str(message))
-                self._note(f"warning: {message}")
+        def take(said: str) -> None:
+            self.record["warnings"].append(said)
+            self._note(f"warning: {said}")
 
-        warnings.showwarning = heard
-        try:
+        with heard(take, lambda said: said in self.record["warnings"]):  # a process that was killed heard it before
             yield
-        finally:
-            warnings.showwarning = shown
 
     def names(self) -> Names:
         """What the inputs are called in the run's files; no names where paths are kept."""

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, is_dataclass
 from importlib import metadata
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 from lightdepth.errors import AlreadyFinished, InputError
 from lightdepth.files.below import files_below
 from lightdepth.files.named_inputs import INPUTS, TOKEN, with_real_inputs
-from lightdepth.files.replacing import check_apart, check_replaceable, clear_notes, read_record, replace, stamp
+from lightdepth.files.replacing import read_record
 from lightdepth.regular import regular
 
 
@@ -27,21 +27,6 @@ def check_finished(output: Path, verb: str, arguments: Mapping[str, Any]) -> Non
     check_same(output, with_real_inputs(record, output), verb, arguments)
     _check_whole(output, record)
     raise AlreadyFinished(f"{output.name} is already finished")
-
-
-def put_finished(made: Path, output: Path, verb: str, arguments: Mapping[str, Any], inputs: Iterable[Path]) -> None:
-    """The run that is asked for takes the place of an older one, where it was killed at its last step, whole. Raises
-    AlreadyFinished then."""
-    try:
-        check_finished(made, verb, arguments)
-    except InputError:
-        return  # of another run
-    except AlreadyFinished:
-        check_apart(output, inputs)
-        check_replaceable(output, verb)
-        clear_notes(made)
-        replace(made, output, stamp(output))
-    raise AlreadyFinished(f"{output.name} was finished by an earlier run, which was killed at its last step")
 
 
 def _check_whole(output: Path, record: Mapping[str, Any]) -> None:

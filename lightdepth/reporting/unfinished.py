@@ -16,8 +16,19 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lightdepth.files.replacing import BEGUN, PARTS, below
+from lightdepth.errors import AlreadyFinished, InputError
+from lightdepth.files.replacing import (
+    BEGUN,
+    PARTS,
+    below,
+    check_apart,
+    check_replaceable,
+    clear_notes,
+    replace,
+    stamp,
+)
 from lightdepth.files.writing import sync, write_whole
+from lightdepth.reporting.same import check_finished
 
 LOG = "log.txt"
 
@@ -126,6 +137,21 @@ def new_files(folder: Path, known: Iterable[str]) -> dict[str, int]:
             if inside not in past:
                 found[inside] = path.stat().st_size
     return found
+
+
+def put_finished(made: Path, output: Path, verb: str, arguments: Mapping[str, Any], inputs: Iterable[Path]) -> None:
+    """The run that is asked for takes the place of an older one, where it was killed at its last step, whole. Raises
+    AlreadyFinished then."""
+    try:
+        check_finished(made, verb, arguments)
+    except InputError:
+        return  # of another run
+    except AlreadyFinished:
+        check_apart(output, inputs)
+        check_replaceable(output, verb)
+        clear_notes(made)
+        replace(made, output, stamp(output))
+    raise AlreadyFinished(f"{output.name} was finished by an earlier run, which was killed at its last step")
 
 
 def _sealed(part: Part, before: str) -> tuple[str, str]:
