@@ -20,6 +20,7 @@ CONFIGS = [
     NetworkConfig(),
     NetworkConfig(norm="batch", width=8, inputs=("rgb", "mask")),
     NetworkConfig(output="absolute", width=8, uncertainty=True),
+    NetworkConfig(output="limited", width=8),
     NetworkConfig(output="free", width=8),
     NetworkConfig(kind="unet", uncertainty=True),
 ]
@@ -89,7 +90,22 @@ def test_an_untrained_residual_network_says_what_the_closed_form_says():
     assert torch.allclose(distance.log()[mask], expected[mask], atol=1e-5)
 
 
-@pytest.mark.parametrize("output", ["residual", "absolute"])
+def test_an_untrained_limited_network_follows_the_closed_form_near_its_mean_and_no_farther_than_a_factor_of_e():
+    image, mask, rays, light = scene(1, 32, 40)
+    image = image**4  # some of it almost black
+    network = build_network(NetworkConfig(output="limited", blur=0.0)).eval()
+    torch.nn.init.zeros_(network.body.head.weight)
+    log_distance = network(image, mask, rays, light)[0].log()[mask]
+    closed = log_closed_form(image, mask, rays, light, 0.0)[mask]
+    apart = closed - closed.mean()
+    said = torch.linalg.lstsq(torch.stack([apart.tanh(), torch.ones_like(apart)], 1), log_distance).solution
+    assert apart.max() > 1.5 and torch.allclose(
+        said, torch.tensor([1.0, float(closed.mean() - apart.tanh().mean())]), atol=1e-4
+    )
+    assert log_distance.max() - log_distance.min() < 2
+
+
+@pytest.mark.parametrize("output", ["residual", "limited", "absolute"])
 def test_the_scale_is_the_closed_forms_whatever_the_weights(output):
     image, mask, rays, light = scene(2, 32, 40)
     network = build_network(NetworkConfig(output=output, width=8)).eval()

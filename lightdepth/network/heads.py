@@ -5,8 +5,10 @@ Notation: t distance along the unit ray r, V = max(R, G, B), c = log t in closed
 
 In: channels chosen by name, each zero outside the mask. Out, from three raw channels (a, h, s):
 
-    log t = mean c + a - mean a    output "absolute"
-    log t = c + a - mean a         output "residual": a correction of the closed form; a = 0 is the baseline
+    log t = mean c + b - mean b    with b = a            output "absolute"
+                                   b = c + a             output "residual": corrects the closed form, which is a = 0
+                                   b = tanh(c - mean c) + a    output "limited": the same, but no farther than a factor
+                                                         of e from the mean, as dark lumen comes out much too far
     log t = a                      output "free": a scale of its own, for losses with a fixed gain
     albedo = (sigmoid h, sigmoid s), hue and saturation of a colour whose value is 1
 
@@ -31,7 +33,7 @@ from lightdepth.photometry import LightTerms
 CHANNELS = {"rgb": 3, "closed_form": 1, "ray_z": 1, "mask": 1, "reflectance": 1}
 """Inputs to choose from, and how many channels each takes; reflectance is the wall's, as the calibration has it."""
 
-OUTPUTS = ("residual", "absolute", "free")
+OUTPUTS = ("residual", "limited", "absolute", "free")
 
 ClosedForm = Callable[[Tensor, Tensor, Tensor, LightTerms, float], Tensor]
 """Log distance of image, mask, rays and light, and the width of the blur."""
@@ -81,8 +83,12 @@ def network_outputs(raw: Tensor, log_closed: Tensor, mask: Tensor, output: str) 
     shape = raw[:, :1].float()
     if output == "free":
         return shape.clamp(-_LOG_LIMIT, _LOG_LIMIT).exp(), raw[:, 1:].float().sigmoid()
-    base = log_closed if output == "residual" else mean_per_image(log_closed, mask)
-    log_distance = base + shape - mean_per_image(shape, mask)
+    mean = mean_per_image(log_closed, mask)
+    if output == "residual":
+        shape = shape + log_closed
+    elif output == "limited":
+        shape = shape + (log_closed - mean).tanh()
+    log_distance = mean + shape - mean_per_image(shape, mask)
     return log_distance.clamp(-_LOG_LIMIT, _LOG_LIMIT).exp(), raw[:, 1:].float().sigmoid()
 
 

@@ -49,10 +49,11 @@ class NetworkConfig:
     """What the network sees at each pixel, a list: rgb (the image), closed_form (log distance, computed from brightness
     alone), ray_z (cosine of the angle from the optical axis), mask (whether tissue shows), reflectance (the share of
     light that the wall throws back, as the calibration has it). What is left out, it has to do without."""
-    output: Literal["residual", "absolute", "free"] = "residual"
+    output: Literal["residual", "limited", "absolute", "free"] = "residual"
     """What the network answers at each pixel: "residual", what is to be added to the log distance of the closed form
-    (which brightness alone gives); "absolute", the log distance itself, but with the closed form's mean in each image;
-    "free", log distance with a scale of its own, as --model.loss.gain one needs it."""
+    (which brightness alone gives); "limited", the same, but with the closed form held within a factor of e of its
+    mean in each image; "absolute", the log distance itself, but with that mean; "free", log distance with a scale of
+    its own, as --model.loss.gain one needs it."""
     encoder: Encoder | None = None
     """Encoder, the part of the network that reads the image: for unet resnet18 (14 million weights), resnet34 or
     resnet50; for dpt vitt14 (6 million), vits14 (25), vitb14 (97) or vitl14 (335). Those with more weights are stronger
