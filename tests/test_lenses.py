@@ -14,7 +14,7 @@ from foreign_lenses import COLMAP_LENSES, FORMATS, drawn, pycolmap_pixels
 from raising import refused
 
 from lightdepth.calibration import read_camera, write_camera
-from lightdepth.camera import CameraModel, FullBrown, KannalaBrandt, Pinhole, Scaramuzza
+from lightdepth.camera import CameraModel, FullBrown, KannalaBrandt, Pinhole, Scaramuzza, camera_from_params
 from lightdepth.camera.foreign import LARGEST_ERROR_PX, ForeignLens, _samples, nearest, opencv_bend
 from lightdepth.cli import main
 from lightdepth.maps import read_map
@@ -168,6 +168,21 @@ def test_a_colmap_lens_that_is_none_of_ours_is_the_nearest_and_its_residual_is_s
     largest = float(str(said[0].message).split("(median), ")[1].split(" ")[0])
     rays = rays_of(camera)
     assert off(camera, pycolmap_pixels(lens, rays), rays) <= 1.6 * largest + 1e-6 <= 1.6 * LARGEST_ERROR_PX
+
+
+@pytest.mark.parametrize("name", [name for name, lens in COLMAP_LENSES.items() if not lens.exact])
+def test_a_colmap_lens_that_is_fitted_to_is_colmap_s_own_from_the_order_of_its_parameters_on(name, monkeypatch):
+    monkeypatch.setattr("lightdepth.camera.params.nearest", lambda lens, where: lens)
+    given = COLMAP_LENSES[name]
+    lens = camera_from_params(given.model, 640, 480, list(given.params))
+    rays = np.random.default_rng(0).normal(0, 0.5, (40, 3)) + (0, 0, 1.6)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    assert isinstance(lens, ForeignLens) and (lens.name, lens.width, lens.height) == (
+        given.model.removeprefix("SIMPLE_"),
+        640,
+        480,
+    )
+    np.testing.assert_allclose(lens.pixels(rays), pycolmap_pixels(given, rays), atol=1e-9)
 
 
 def test_a_lens_that_none_of_ours_comes_near_is_refused_with_the_residual(tmp_path, capsys):
