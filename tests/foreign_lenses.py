@@ -40,6 +40,10 @@ COLMAP_LENSES = {
     "eucm": ColmapLens("EUCM", (*_F, 0.6, 1.1)),
     "fov": ColmapLens("FOV", (*_F, 0.9)),
     "thin prism": ColmapLens("THIN_PRISM_FISHEYE", (*_F, 0.02, 0.003, 2e-4, 1e-4, 0.001, 0.0002, 1e-4, 1e-4)),
+    "aria": ColmapLens(
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+        (*_F, 0.02, 0.003, 0.001, 0.0002, 1e-4, -2e-4, 3e-4, -1e-4, 2e-4, 1e-4, -3e-4, 5e-5),
+    ),
 }
 
 

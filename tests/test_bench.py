@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import check_self_contained
 from raising import refused
 
 from densify.bench import verdict
@@ -67,6 +68,7 @@ def test_a_run_has_every_row_for_every_share_with_units_and_versions(made):
         assert list(rows) == ["sparse map", "decline, one scale", "decline, full"]
         assert 0 < rows["decline, one scale"]["rms_mm"] < 20
     assert (made / "bench.png").stat().st_size > 10_000
+    assert check_self_contained(made / "report.html").tags.count("table") == 1 + len(found["cells"])
     table = (made / "bench.md").read_text()
     assert "30% wrong points." in table and all(title in table for title in COLUMNS.values()) and "tiny (311)" in table
 

@@ -22,6 +22,7 @@ from lightdepth.camera import (
     Scaramuzza,
     camera_from_params,
 )
+from lightdepth.camera.provenance import Provenance
 from lightdepth.datasets.c3vd import C3VD_V2
 
 # Strong enough for tangential terms to fold the image before radial ones would
@@ -374,6 +375,7 @@ BAD = {
     "focal lengths -5": lambda: KannalaBrandt(640, 480, -5.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     "a0 = -769": lambda: Scaramuzza(640, 480, 0.0, 0.0, -769.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
     "singular": lambda: Scaramuzza(640, 480, 0.0, 0.0, 769.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "[[c, d], [e, 1]]": lambda: Scaramuzza(640, 480, 0.0, 0.0, 769.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0),
     "my.json … unknown camera model 'MEI'": lambda: camera_from_params("MEI", 640, 480, [1.0], "my.json"),
     "my.json … 3 parameters of PINHOLE": lambda: camera_from_params("PINHOLE", 9, 9, [1.0] * 3, "my.json"),
     "my.json: PINHOLE camera … focal": lambda: camera_from_params("PINHOLE", 9, 9, [-1.0] * 4, "my.json"),
@@ -384,6 +386,30 @@ BAD = {
 def test_a_camera_that_cannot_be_is_refused_by_name(message):
     with refused(message):
         BAD[message]()
+
+
+def test_a_stretch_is_singular_by_its_determinant_and_not_by_the_size_of_its_shear():
+    sheared = Scaramuzza(640, 480, 320.0, 240.0, 300.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, -1.0)
+    pixel = sheared.project(sheared.unproject(np.array([350.0, 260.0]))[0])[0]
+    np.testing.assert_allclose(pixel, [350, 260])
+
+
+@pytest.mark.parametrize(
+    ("source", "deviation", "short"),
+    [
+        ("measured", None, ""),
+        ("published", 0.5, ""),
+        ("given", None, ""),
+        ("self-calibrated", 0.015, ""),
+        ("self-calibrated", 0.016, "the camera is self-calibrated, its focal length known to 1.6 % only"),
+        ("self-calibrated", None, "the camera is self-calibrated, nobody knows how well"),
+        ("assumed", None, "the camera is assumed, not calibrated"),
+    ],
+)
+def test_a_camera_that_nobody_calibrated_is_doubted_in_its_note_s_words_or_in_ours(source, deviation, short):
+    assert Provenance(source, deviation).in_short == short
+    assert Provenance(source, deviation).doubt == (short and f"{short}: lengths and shapes may be wrong")
+    assert Provenance(source, deviation, "ask who guessed it").doubt == (short and "ask who guessed it")
 
 
 def test_a_twentieth_of_a_pixel_beyond_the_fold_there_is_no_ray_and_within_there_is():

@@ -74,6 +74,8 @@ def test_points_are_before_the_camera_or_their_place_on_the_plane_is_finite(kind
     points = kind(np.array([[2.0, -4.0, 2.0], [1.0, 1.0, -1.0], [1.0, 0.0, 0.0], [3.0, 4.0, 5e-4], [3.0, 4.0, 1e-5]]))
     plane, front = to_plane(points)
     assert front.tolist() == [True, False, False, True, False]
+    aside = kind(np.array([[5.0, 0.0, 6e-5], [5.0, 0.0, 4e-5], [0.0, -5.0, 6e-5], [0.0, -5.0, 4e-5]]))
+    assert to_plane(aside)[1].tolist() == [True, False, True, False]
     assert plane[0].tolist() == [1, -2] and plane[1].tolist() == [1, 1] and np.isfinite(np.asarray(plane)).all()
 
 
@@ -145,6 +147,10 @@ def test_a_model_of_others_without_what_is_its_own_is_one_of_ours(model, numbers
 def test_a_scaramuzza_lens_that_never_bends_back_ends_at_a_right_angle_and_one_that_does_ends_there():
     straight = Scaramuzza(400, 300, 200.0, 150.0, 100.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
     assert straight.max_theta() == pytest.approx(np.arctan(2 * 250 / 100)) and straight.focal_length == 100
+    part = straight.cropped(200, 150, 200, 150)  # whose axis is in its corner
+    assert part.max_theta() == straight.max_theta() and part.unproject(np.array([200.0, 150.0]))[1]
+    small = straight.cropped(190, 145, 20, 10)  # twice as far as its corners is nothing: by the lens
+    assert small.max_theta() == pytest.approx(np.arctan(4))
     bending = Scaramuzza(400, 300, 200.0, 150.0, 100.0, 0.0, -4e-3, 0.0, 0.0, 1.0, 0.0, 0.0)
     assert np.degrees(bending.max_theta()) == pytest.approx(90, abs=0.2)
     # theta turns over where rho h' = h: at rho = sqrt(a0 / a2), 45 degrees
@@ -192,3 +198,15 @@ def test_brown_ends_where_its_jacobian_is_first_singular_in_any_direction(terms)
     assert camera._max_radius() == pytest.approx(first, abs=2e-3)
     longer = FullBrown(640, 480, 400.0, 408.0, 328.0, 236.8, *terms, 0.0, 0.0, 0.0, 0.0)
     assert longer._max_radius() == pytest.approx(first, abs=2e-3)
+
+
+@pytest.mark.parametrize("p", [(0.3, 0.0), (0.0, -0.55), (-0.4, 0.38)])
+def test_a_lens_whose_resolution_grows_faster_than_its_decentring_takes_away_never_folds(p):
+    """Along the decentring 1 + 3 k1 r² - 6 p r has no root where 3 p² < k1; no other direction is the first to fold."""
+    for camera in (
+        Brown(64, 48, 40.0, 40.0, 32.0, 24.0, 1.0, 0.0, *p),
+        FullBrown(64, 48, 40.0, 40.0, 32.0, 24.0, 1.0, 0.0, *p, 0.0, 0.0, 0.0, 0.0),
+    ):
+        assert camera._max_radius() == np.inf
+    folding = Brown(64, 48, 40.0, 40.0, 32.0, 24.0, 0.3 * (p[0] ** 2 + p[1] ** 2), 0.0, *p)
+    assert np.isfinite(folding._max_radius())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -65,3 +66,25 @@ def test_the_users_own_folder_is_closed_to_others_and_one_that_is_not_is_not_use
     again = compiled(twice)
     assert open_to_others(cache_folder()) and again(np.arange(3)).tolist() == [0, 2, 4]
     assert not again.stats.cache_hits
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs modes of files")
+def test_a_folder_is_open_where_its_group_or_all_may_write_to_it_and_one_that_is_not_there_is_not(tmp_path):
+    assert not open_to_others(tmp_path / "none")
+    for mode, is_open in ((0o700, False), (0o755, False), (0o720, True), (0o702, True), (0o700, False)):
+        tmp_path.chmod(mode)
+        assert open_to_others(tmp_path) == is_open
+
+
+def test_machine_code_lies_in_the_users_folder_and_is_stamped_by_the_content_of_its_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    file = tmp_path / "loops.py"
+    file.write_text("# one\n", encoding="utf-8")
+    place = module._Own(twice, str(file))
+    place.ensure_cache_path()
+    assert cache_folder() in Path(place.get_cache_path()).parents and Path(place.get_cache_path()).is_dir()
+    stamp = place.get_source_stamp()
+    assert place.get_source_stamp() == stamp
+    file.write_text("# another\n", encoding="utf-8")
+    assert place.get_source_stamp() != stamp

@@ -7,6 +7,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+from pages import check_self_contained
 from raising import refused
 
 from densify.bench.estimators import (
@@ -97,6 +98,8 @@ def test_the_verb_writes_table_figure_and_sentences_on_where_lmeds_loses(tmp_pat
     text = (tmp_path / "out" / "estimators.md").read_text()
     assert all(name in text for name in ESTIMATORS) and "LMedS loses" in text
     assert (tmp_path / "out" / "estimators.png").read_bytes()[:4] == b"\x89PNG"
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert check_self_contained(tmp_path / "out" / "report.html").tags.count("img") == 1 and "LMedS loses" in page
 
 
 def test_losses_are_found_where_the_records_have_them():

@@ -19,6 +19,7 @@ from verbs import by_options
 
 from densify.commands.evaluate import evaluate as evaluate_verb
 from densify.config import DensifyConfig
+from densify.evaluation.files import long_rows, write_evaluations
 from densify.evaluation.in_short import in_short
 from densify.evaluation.judge import judge_maps
 from densify.evaluation.judge_depth import judge_depth
@@ -28,10 +29,8 @@ from densify.evaluation.tables import (
     Table,
     cell_text,
     depth_table,
-    long_rows,
     surface_table,
     trajectory_table,
-    write_evaluations,
 )
 from densify.evaluation.truth import read_truth
 from densify.pipeline import densify

@@ -40,6 +40,16 @@ def test_a_patch_into_which_brightness_rises_slowly_is_the_top_of_a_wall_and_no_
     assert not found(v).any() and torch.equal(found(v, contrast=0.0), v >= 0.97)
 
 
+@pytest.mark.parametrize(("border", "ring", "kept"), [(0.0, 0.95, False), (0.96, 0.85, True)])
+def test_a_patch_is_compared_with_the_ring_behind_its_border_and_neither_with_the_border_nor_with_itself(
+    border, ring, kept
+):
+    v = wall(value=ring)
+    v[..., 19:26, 29:36] = border  # one pixel wide
+    v[..., 20:25, 30:35] = 1.0
+    assert torch.equal(found(v), (v >= 0.97) & kept)
+
+
 def test_size_is_a_share_of_the_mask_and_the_widths_grow_with_the_image():
     v = wall()
     v[..., 20:27, 30:37] = 1.0

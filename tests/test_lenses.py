@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import yaml
 from foreign_lenses import COLMAP_LENSES, FORMATS, drawn, pycolmap_pixels
-from raising import refused
+from raising import refused, warned
 
 from lightdepth.calibration import read_camera, write_camera
-from lightdepth.camera import CameraModel, FullBrown, KannalaBrandt, Pinhole, Scaramuzza
-from lightdepth.camera.foreign import LARGEST_ERROR_PX, ForeignLens, _samples, nearest, opencv_bend
+from lightdepth.camera import CameraModel, FullBrown, KannalaBrandt, Pinhole, Scaramuzza, camera_from_params
+from lightdepth.camera.foreign import LARGEST_ERROR_PX, ForeignLens, _samples, fov_bend, nearest, opencv_bend
 from lightdepth.cli import main
 from lightdepth.maps import read_map
 from lightdepth.native import pycolmap
@@ -168,6 +168,21 @@ def test_a_colmap_lens_that_is_none_of_ours_is_the_nearest_and_its_residual_is_s
     largest = float(str(said[0].message).split("(median), ")[1].split(" ")[0])
     rays = rays_of(camera)
     assert off(camera, pycolmap_pixels(lens, rays), rays) <= 1.6 * largest + 1e-6 <= 1.6 * LARGEST_ERROR_PX
+
+
+@pytest.mark.parametrize("name", [name for name, lens in COLMAP_LENSES.items() if not lens.exact])
+def test_a_colmap_lens_that_is_fitted_to_is_colmap_s_own_from_the_order_of_its_parameters_on(name, monkeypatch):
+    monkeypatch.setattr("lightdepth.camera.params.nearest", lambda lens, where: lens)
+    given = COLMAP_LENSES[name]
+    lens = camera_from_params(given.model, 640, 480, list(given.params))
+    rays = np.random.default_rng(0).normal(0, 0.5, (40, 3)) + (0, 0, 1.6)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    assert isinstance(lens, ForeignLens) and (lens.name, lens.width, lens.height) == (
+        given.model.removeprefix("SIMPLE_"),
+        640,
+        480,
+    )
+    np.testing.assert_allclose(lens.pixels(rays), pycolmap_pixels(given, rays), atol=1e-9)
 
 
 def test_a_lens_that_none_of_ours_comes_near_is_refused_with_the_residual(tmp_path, capsys):
@@ -325,6 +340,16 @@ def test_a_lens_of_nearly_our_longest_polynomial_becomes_that_and_is_off_by_what
     rays = rays_of(camera)
     assert 0 < off(camera, lens.pixels(rays), rays) < 0.1
     np.testing.assert_allclose(camera.params[:5], (420, 410, 322, 238, -0.3), rtol=0.01)
+
+
+@pytest.mark.parametrize("center", [(-50.0, 240.0), (700.0, 300.0)], ids=str)
+def test_a_lens_whose_axis_lies_outside_its_image_becomes_the_nearest_as_well(center):
+    """The image is cut out of a larger one, whose middle it does not hold."""
+    with warned("FOV lens read as OPENCV_FISHEYE"):
+        camera = camera_from_params("FOV", 640, 480, [400.0, 410.0, *center, 0.9])
+    rays = rays_of(camera)
+    lens = ForeignLens("FOV", 640, 480, (400.0, 410.0, *center), fov_bend(0.9))
+    assert len(rays) > 200 and off(camera, lens.pixels(rays), rays) < 0.02
 
 
 def test_a_lens_is_sampled_to_the_corners_of_its_image():

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pages import check_self_contained
 from raising import refused
 from verbs import by_options
 
@@ -65,6 +66,8 @@ def test_a_run_says_its_tables_and_the_next_takes_its_colons(run, tmp_path):
     text = (run / "per-frame.md").read_text(encoding="utf-8")
     assert "strong bounce" in text and "weak bounce" in text and "water drops" in text
     assert (run / "colons.png").stat().st_size > 1000
+    page = check_self_contained(run / "report.html")
+    assert page.tags.count("img") == 1
     bench.compare_per_frame(tmp_path / "again", bench.ModelSources(("constant",)), colons=run / "colons")
     again = json.loads((tmp_path / "again" / "per-frame.json").read_text(encoding="utf-8"))
     assert again["rows"] == found["rows"] and not (tmp_path / "again" / "colons").exists()

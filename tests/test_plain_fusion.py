@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import BROWN, ENDOMAPPER, slanted_plane
 
 from densify.fusion.plain import PlainTsdf, undistorted, undistorted_camera
-from lightdepth.camera import CameraModel, Pinhole
+from lightdepth.camera import Brown, CameraModel, Pinhole
 
 NORMAL, HEIGHT = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0]), 12.0
+FOLDING = Brown(135, 108, 80.0, 80.0, 67.0, 54.0, -0.4, 0.0, 0.0, 0.0)  # at 42 degrees, within the image
 
 
 @pytest.mark.parametrize("camera", [BROWN.resized(135, 108), ENDOMAPPER.resized(144, 108)], ids=lambda c: c.name)
@@ -36,6 +39,24 @@ def test_what_is_beyond_the_greatest_distance_along_its_ray_has_no_depth():
     distance = whole / pinhole.rays()[0][..., 2]
     np.testing.assert_array_equal(near > 0, (whole > 0) & (distance <= 14.0))
     assert 0.1 < (near > 0).sum() / (whole > 0).sum() < 0.9
+
+
+@pytest.mark.parametrize("camera", [ENDOMAPPER.resized(144, 108), FOLDING], ids=lambda c: c.name)
+def test_beside_what_the_model_does_not_know_and_beyond_the_lens_s_field_there_is_no_depth(camera: CameraModel):
+    """Neither a mixture of depth and nothing, nor what the middle shows, into which a lens projects beyond its fold."""
+    prediction = slanted_plane(camera).prediction()
+    valid = prediction.valid.copy()
+    valid[24:40, 84:104] = False
+    depth, _, pinhole = undistorted(replace(prediction, valid=valid), np.zeros((108, camera.width, 3)))
+    rays, _ = pinhole.rays()
+    pixels, seen = camera.project(rays)
+    known = depth > 0
+    np.testing.assert_allclose(depth[known], (-HEIGHT / (rays @ NORMAL) * rays[..., 2])[known], rtol=0.02)
+    assert seen[known].all() and 0.5 < known.mean() < 0.98
+    column, row = np.floor(pixels[known] - 0.5).astype(int).T  # the first of the four that it lies between
+    inner = (column >= 0) & (row >= 0) & (column < camera.width - 1) & (row < 107)
+    around = [valid[row[inner] + r, column[inner] + c] for r in (0, 1) for c in (0, 1)]
+    assert np.mean(around) > 0.999
 
 
 def test_the_undistorted_camera_has_the_lens_s_focal_length_and_principal_point():

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from scenes import C3VD, ENDOMAPPER, PINHOLE, Scene, cylinder, ray_tensors, slanted_plane, sphere
 
 from lightdepth.camera import Pinhole
@@ -177,6 +178,17 @@ def test_each_image_of_a_batch_keeps_its_own_reflectance():
     found = indirect_irradiance(*twice, batch)
     assert (found[0] == 0).all()
     torch.testing.assert_close(found[1:], indirect(scene))
+
+
+def test_the_middle_of_an_element_has_the_element_s_own_light_to_the_border_of_the_image():
+    """What the same wall gets when each of its squares is a pixel."""
+    scene = cylinder(Pinhole(24, 18, 14.0, 14.0, 12.0, 9.0), farthest=math.inf)
+    assert scene.valid.all()
+    distance = F.avg_pool2d(scene.distance.log(), 3).exp()
+    rays = F.normalize(F.avg_pool2d(scene.rays, 3), dim=1)
+    expected = indirect_irradiance(distance, rays, torch.ones_like(distance, dtype=torch.bool), lit(0.6), pool=1)
+    assert float(expected.max() / expected.min()) > 1.5
+    torch.testing.assert_close(indirect(scene, pool=3)[..., 1::3, 1::3], expected)
 
 
 def test_no_gradient_flows_through_it():

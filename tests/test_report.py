@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import base64
-import re
 from dataclasses import replace
-from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
 from colons import colon, sequence, slam, truth
+from pages import References, check_self_contained
 
 from densify.config import DensifyConfig
 from densify.evaluation.records import AlignedFigures, DistanceFigures, MapFigures, SurfaceFigures
@@ -23,31 +20,6 @@ from lightdepth.reporting.report import Report, number
 PIXEL = png(np.zeros((1, 1, 3), np.uint8))
 
 
-class References(HTMLParser):
-    """Every address that a page would load or lead to, and its tags."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.found: list[str] = []
-        self.tags: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.found += [value for name, value in attrs if name in ("src", "href", "srcset", "data", "action") and value]
-
-
-def check_self_contained(path: Path) -> References:
-    text = path.read_text()
-    page = References(text)
-    assert all(re.match("data:image/(png|jpeg);base64,", address) for address in page.found)
-    assert not {"link", "iframe", "base"} & set(page.tags)  # of programs it has its own alone: none has an address
-    assert not re.search(r"https?://|url\(|@import", text)
-    for address in page.found:
-        assert base64.b64decode(address.split(",", 1)[1]).startswith((b"\x89PNG", b"\xff\xd8"))
-    return page
-
-
 def test_a_page_has_its_parts_in_order_and_loads_nothing(tmp_path):
     page = Report("Title & more")
     page.heading("First")
@@ -56,7 +28,7 @@ def test_a_page_has_its_parts_in_order_and_loads_nothing(tmp_path):
     page.figures([(PIXEL, 'a "caption"'), (PIXEL, "another")])
     page.write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
-    assert len(check_self_contained(tmp_path / "report.html").found) == 2
+    assert len(check_self_contained(tmp_path / "report.html").pictures) == 2
     parts = ["Title &amp; more</h1>", "First</h2>", "a &lt; b", "<table>", ">1.23<", ">–<", "a &quot;caption&quot;"]
     assert [text.index(p) for p in parts] == sorted(text.index(p) for p in parts)
     assert text.startswith("<!doctype html>") and [p.name for p in tmp_path.iterdir()] == ["report.html"]
@@ -113,7 +85,7 @@ def test_the_report_of_a_run_shows_surfaces_scales_points_and_agreement(made, tm
     densify_page("Maps", results, gallery, ["a note"]).write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     page = check_self_contained(tmp_path / "report.html")
-    assert len(page.found) == 1 + 6 + 1 + len(gallery.pictures[0]) >= 5
+    assert len(page.pictures) == 1 + 6 + 1 + len(gallery.pictures[0]) >= 5
     for part in ("a note", "4 of 4", "Agreement", "hidden blocks", "constant, bent", "Scale of each keyframe", "Time"):
         assert part in text
     assert "Errors against the truth" not in text

@@ -279,7 +279,7 @@ def test_a_finer_image_is_averaged_in_whole_squares_over_what_is_known():
     rng = np.random.default_rng(0)
     distance, image = 3 + 0.01 * rng.random((4, 5)), rng.uniform(0.2, 0.8, (4, 5, 3)).astype(np.float32)
     valid = np.ones((4, 5), bool)
-    valid[0, 0] = valid[2:, 4] = False
+    valid[0, 0] = valid[2:, 4] = valid[2, 2:4] = valid[3, 2] = False  # three, none and one of a square are left
     view = surface_view(predicted(distance, valid, camera), image, RectifyConfig(focal_px=15.0, feather=0.0))
     points = camera.rays()[0] * distance[..., None]
     for k, (rows, columns) in enumerate(
@@ -304,6 +304,8 @@ def test_directions_find_the_pixel_that_they_fall_into_and_none_outside_the_imag
     found = view.table.look_up(rays * np.float32(0.3), np.zeros((3, 1), np.float32))[:, 0]
     expected = places[:, 1].astype(int) * 14 + places[:, 0].astype(int)
     assert (found[inner] == expected[inner]).mean() > 0.97 and inner.sum() > 200
+    ahead, centred = np.array([[0, 0, 2.0]], np.float32), _table(Pinhole(14, 11, 14.0, 15.0, 6.5, 5.5), 1)
+    assert centred.look_up(ahead, np.zeros((3, 1), np.float32)).tolist() == [[5 * 14 + 6]]
     outside = CAMERA.unproject(np.array([[-1.0, 5], [15, 5], [7, -1], [7, 12], [-40, 5], [7, 60]]))[0]
     away = np.concatenate([outside, -rays[:4], [[0, 0, -1.0], [1, 0, 0], [0, -1, 0]]]).astype(np.float32)
     lost = view.table.look_up(away[:, :] * np.float32(7), np.zeros((3, 1), np.float32))
@@ -342,9 +344,12 @@ def test_a_lens_on_merged_pixels_has_their_rays_and_the_angles_between_them(came
         np.testing.assert_allclose(found, np.linalg.norm(np.diff(rays, axis=axis), axis=-1), atol=1e-6)
 
 
-def test_cells_of_directions_are_six_tenths_of_the_least_way_between_pixels():
-    table = looks()[0][0].table
-    rays = CAMERA.rays()[0]
+@pytest.mark.parametrize(
+    "camera", [CAMERA, Pinhole(14, 11, 14.0, 40.0, 6.2, 5.9), Pinhole(14, 11, 40.0, 14.0, 6.2, 5.9)]
+)
+def test_cells_of_directions_are_six_tenths_of_the_least_way_between_pixels(camera):
+    table = _table(camera, 1)
+    rays = camera.rays()[0]
     place = rays[..., :2] / (1 + rays[..., 2:])
     ways = [np.linalg.norm(np.diff(place, axis=axis), axis=-1).min() for axis in (0, 1)]
     assert 0.57 < 1 / table.scale / min(ways) < 0.6
@@ -381,6 +386,21 @@ def test_dark_and_bright_pixels_weigh_less_and_unsure_ones_by_their_sigma(channe
     weights = surface_view(replace(predicted(facing), uncertainty=sigma), image, config).weights[:-1].reshape(11, 14)
     lit = np.where(np.arange(14) < 7, 1.0, 0.7) / np.where(np.arange(11) < 6, 2.0, 1.0)[:, None]
     np.testing.assert_allclose(weights, 255 * lit * CAMERA.rays()[0][..., 2], atol=1.01)
+
+
+def test_a_view_is_in_single_precision_and_so_is_the_lens_that_is_kept_for_the_next():
+    view, rays = looks()[1][0], _lens(CAMERA, 1).rays
+    assert [a.dtype for a in (rays, view.points, view.planes)] == [np.float32] * 3
+    assert [a.dtype for a in (view.weights, view.colors, view.table.cells)] == [np.uint8, np.uint8, np.int32]
+    assert all(a.flags.c_contiguous for a in (rays, view.points, view.planes, view.weights, view.colors))
+
+
+def test_averaged_pixels_end_with_those_whose_points_are_beyond_the_given_distance():
+    fine = Pinhole(28, 22, 28.0, 30.0, 12.4, 11.8)
+    facing, config = 2.0 / fine.rays()[0][..., 2], RectifyConfig(focal_px=14.5, feather=0.0)
+    whole, near = (surface_view(predicted(facing, camera=fine), colours(fine), config, most) for most in (np.inf, 2.1))
+    far = np.linalg.norm(whole.points[:, :-1], axis=0) > 2.1
+    assert len(far) == 14 * 11 and 20 < far.sum() < 120 and np.array_equal(near.weights[:-1] == 0, far)
 
 
 def test_beyond_the_given_distance_nothing_is_known_but_bends_the_planes_beside_it_as_it_should():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import msgpack
 import numpy as np
+from raising import refused
 from test_trajectory import case, poses, trajectory
 
 from densify.evaluation.trajectory import (
@@ -45,6 +47,16 @@ def test_a_tum_file_is_one_map_whose_name_says_whether_it_is_keyframes_alone(tmp
         assert (found.id, found.whole, found.keyframe.tolist()) == (0, whole, [True] * 5)
         assert found.numbers.tolist() == [1, 3, 5, 7, 9]
         np.testing.assert_allclose(found.centers, source[[1, 0, 3, 2, 4]], atol=1e-6)
+
+
+def test_seconds_are_counted_by_the_rate_of_the_one_stella_map_beside_the_trajectory(tmp_path):
+    source, _ = case(1, 5)
+    write_tum(tmp_path / "frames.txt", np.array([3.0, 1.0, 7.0, 5.0, 9.0]) / 25, poses(source).values())
+    (tmp_path / "map.msg").write_bytes(msgpack.packb({"cameras": {"a": {"fps": 25.0}}}))
+    assert read_trajectories(tmp_path / "frames.txt")[0].numbers.tolist() == [1, 3, 5, 7, 9]
+    (tmp_path / "map_2.msg").write_bytes(msgpack.packb({"cameras": {"a": {"fps": 30.0}}}))
+    with refused(where="frames.txt", found="is not a frame number"):
+        read_trajectories(tmp_path / "frames.txt")
 
 
 def test_poses_are_put_in_order_with_their_centres_and_marks():

@@ -37,6 +37,8 @@ from densify.bench.spoilt import SpoiltFrame, spoilt_frames, spoilt_tables
 from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, ModelSources, cells_of, load_models, predicted
 from densify.config import DensifyConfig, OfflineConfig, Recipe
+from densify.evaluation.page import tables_page
+from densify.evaluation.tables import Table
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, ModelSource
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
@@ -97,7 +99,8 @@ def run(
     """Synthetic colons made from seeds, judged row by row; also compare, estimators, per-frame, completion.
 
     Args:
-        output: Folder to make, with bench.json, bench.md, and bench.png (error against coverage and by distance).
+        output: Folder to make, with bench.json, bench.md, bench.png (error against coverage and by distance), and
+            report.html with all of it.
         size: How much is measured: small, two short sequences, minutes; full, eight, and one ten times as long (the
             screening), up to an hour.
         first_seed: Number that seeds the first scene; the others count on from it. Bundled checkpoints were trained on
@@ -146,13 +149,13 @@ def run(
         cells, seconds = _cells(folder, config, models)
         found = record(config, cells, seconds)
         _write_json(folder, "bench.json", found)
-        text = "\n".join([*(t.markdown() for t in tables(found)), *(f"{note}\n" for note in notes(found))])
-        (folder.folder / "bench.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         picture = bench_picture(found["cells"])
         if picture is not None:
             (folder.folder / "bench.png").write_bytes(picture)
-        folder.log(text)
-    end(output, then=f"lightdepth bench compare {quote(str(output))} OTHER", page=output / "bench.md")
+        caption = "Median error over the share of the truth that is met, and error by distance"
+        pictures = [] if picture is None else [(picture, caption)]
+        _write_tables(folder, "bench", "Surfaces of synthetic colons", tables(found), notes(found), pictures)
+    end(output, then=f"lightdepth bench compare {quote(str(output))} OTHER", page=output / "report.html")
 
 
 def _cells(
@@ -215,7 +218,7 @@ def compare_estimators(
     """Estimators of a keyframe's scale side by side, by share, kind and number of wrong points.
 
     Args:
-        output: Folder to make, with estimators.json, .md and .png.
+        output: Folder to make, with estimators.json, .md and .png, and report.html.
         shares: Shares, in [0, 1), of a keyframe's points that are wrong, each judged on its own. More shares take
             longer, and larger ones are harder.
         points: Numbers of points per keyframe, each at least 8 and judged on its own. More numbers take longer, and
@@ -234,11 +237,12 @@ def compare_estimators(
         unit = "shares of 1: |found scale / true scale - 1|"
         data = {"kind": "estimators", "unit": unit, "config": asdict(config), "records": records, "notes": said}
         _write_json(folder, "estimators.json", data | {"versions": versions(), "revision": git_revision()})
-        text = "\n".join([*(t.markdown() for t in estimators_tables(records)), *(f"{line}\n" for line in said)])
-        (folder.folder / "estimators.md").write_text(text, encoding="utf-8", errors="backslashreplace")
-        (folder.folder / "estimators.png").write_bytes(estimators_picture(records))
-        folder.log(text)
-    end(output, then="lightdepth bench estimators -o OTHER --draws 200", page=output / "estimators.md")
+        picture = estimators_picture(records)
+        (folder.folder / "estimators.png").write_bytes(picture)
+        pictures = [(picture, "Error of the scale by the share of wrong points")]
+        title = "Estimators of a keyframe's scale"
+        _write_tables(folder, "estimators", title, estimators_tables(records), said, pictures)
+    end(output, then="lightdepth bench estimators -o OTHER --draws 200", page=output / "report.html")
 
 
 def compare_per_frame(
@@ -252,8 +256,8 @@ def compare_per_frame(
     """Depth of single frames beside the closed form, on twelve colons of a renderer that nothing was trained on.
 
     Args:
-        output: Folder to make, with per-frame.json and .md, and unless --colons is given the colons' frames and their
-            truth in colons/, each a sequence that predict and evaluate read, and a picture of them.
+        output: Folder to make, with per-frame.json, .md and report.html, and unless --colons is given the colons'
+            frames and their truth in colons/, each a sequence that predict and evaluate read, and a picture of them.
         colons: Folder colons/ of an earlier run, whose frames are taken in place of making them anew, which takes some
             ten minutes.
         spoilt: Judge frames with blur, smoke, water drops, clipping, noise and compression too, at five severities:
@@ -284,15 +288,15 @@ def compare_per_frame(
                 sequences.append(per_frame.read_colon(colon, place))
                 rows += [per_frame.ColonFigures(**row) for row in folder.kept_of(colon.name)["clean"]]
                 bad += [SpoiltFrame(**row) for row in folder.kept_of(colon.name)["spoilt"]]
-        text = "\n".join(table.markdown() for table in [*per_frame.tables(rows), *spoilt_tables(bad)])
         found = per_frame.record(rows) | {"spoilt": [asdict(row) for row in bad], "versions": versions()}
         _write_json(folder, "per-frame.json", found)
-        (folder.folder / "per-frame.md").write_text(text, encoding="utf-8", errors="backslashreplace")
         write_image(folder.folder / "colons.png", per_frame.contact_sheet(sequences))
-        folder.log(text)
+        pictures = [((folder.folder / "colons.png").read_bytes(), "A frame of each colon")]
+        shown = [*per_frame.tables(rows), *spoilt_tables(bad)]
+        _write_tables(folder, "per-frame", "Depth of single frames", shown, [], pictures)
     made = quote(str(output / "colons" if colons is None else colons))
     then = f"lightdepth bench per-frame -o OTHER --colons {made} --checkpoints '[CHECKPOINT]'"
-    end(output, then=then, page=output / "per-frame.md")
+    end(output, then=then, page=output / "report.html")
 
 
 def compare_completions(
@@ -354,6 +358,23 @@ def compare_completions(
         folder.log(text)
     then = "lightdepth bench completion -o OTHER --external '[NAME=FOLDER]'"
     end(output, then=then, page=output / "report.html")
+
+
+def _write_tables(
+    run: Run,
+    name: str,
+    title: str,
+    shown: Sequence[Table],
+    said: Sequence[str],
+    pictures: Sequence[tuple[bytes, str]],
+) -> None:
+    """Tables and the sentences below them as NAME.md, in the log, and with the pictures on a page."""
+    text = "\n".join([*(table.markdown() for table in shown), *(f"{line}\n" for line in said)])
+    (run.folder / f"{name}.md").write_text(text, encoding="utf-8", errors="backslashreplace")
+    page = tables_page(title, said, shown, pictures)
+    page.files(run.folder, {f"{name}.md": "the tables", f"{name}.json": "every figure, for programs"})
+    page.write(run.folder / "report.html")
+    run.log(text)
 
 
 def _write_json(run: Run, name: str, data: Mapping[str, object]) -> None:

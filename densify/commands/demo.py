@@ -7,10 +7,10 @@ from typing import Annotated
 
 from densify.config import DensifyConfig
 from densify.densified import Densified
+from densify.evaluation.files import write_evaluations
 from densify.evaluation.in_short import in_short
 from densify.evaluation.judge import judge_maps
 from densify.evaluation.judged_map import dense_models, read_run
-from densify.evaluation.tables import write_evaluations
 from densify.evaluation.truth import read_truth
 from densify.page import FILES, densify_page
 from lightdepth.checkpoint import ModelSource

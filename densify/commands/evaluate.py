@@ -7,11 +7,12 @@ from shlex import quote
 
 from densify.config import DensifyConfig
 from densify.evaluation.depth_files import DepthReading
+from densify.evaluation.files import write_evaluations
 from densify.evaluation.in_short import in_short
 from densify.evaluation.judge import judge_gap
 from densify.evaluation.judged_map import read_run
+from densify.evaluation.page import evaluation_page
 from densify.evaluation.records import Sources
-from densify.evaluation.tables import write_evaluations
 from densify.judged import DenseModel, JudgingConfig, TruthSource, dense_first, judge_asked, read_asked
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
@@ -69,6 +70,8 @@ def evaluate(
         out.hash_inputs(truth=source.truth)
         answer = judge_asked(asked, first, out)
         sources = Sources(run, source.truth, gap, "" if first is None else str(first))
-        write_evaluations(answer.found, out.folder, answer.withheld, sources, asked.suite)
+        judged = (answer.found, out.folder, answer.withheld, sources, asked.suite)
+        write_evaluations(*judged)
+        evaluation_page(*judged).write(out.folder / "report.html")
         out.log(in_short(answer.found, answer.withheld, sources))
-    end(folder, then=f"cat {quote(str(folder / 'metrics.md'))}", page=folder / "metrics.md")
+    end(folder, then=f"cat {quote(str(folder / 'metrics.md'))}", page=folder / "report.html")

@@ -7,7 +7,7 @@ means. Every other figure is in the files.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from densify.evaluation.pictures import MODELS
 from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged, Sources, SurfaceFigures
@@ -21,6 +21,17 @@ def in_short(
     sources: Sources | None = None,
 ) -> str:
     """The text of a few tables, and what could not be judged."""
+    notes = not_judged(found)
+    if sources is not None:
+        notes += [] if sources.gap is None else [gap_note(sources.gap)]
+        notes += [f"{sources.made}.\n"] if sources.made else []
+    return "\n".join([*(t.markdown() for t in short_tables(found, withheld)), *notes]).rstrip()
+
+
+def short_tables(
+    found: Mapping[str, Evaluation[DepthJudged | MapsJudged]], withheld: Sequence[WithheldOfMap] = ()
+) -> list[Table]:
+    """Depth's means, a line for each map or sequence, and agreement with hidden blocks of the maps."""
     results = {name: e.judged for name, e in found.items()}
     depth = {name: j for name, j in results.items() if isinstance(j, DepthJudged)}
     posed = {name: j for name, j in results.items() if isinstance(j, MapsJudged)}
@@ -33,11 +44,7 @@ def in_short(
         tables.append(_maps_table(posed))
     if withheld:
         tables.append(withheld_table(withheld))
-    notes = [*_not_judged(posed)]
-    if sources is not None:
-        notes += [] if sources.gap is None else [gap_note(sources.gap)]
-        notes += [f"{sources.made}.\n"] if sources.made else []
-    return "\n".join([*(t.markdown() for t in tables), *notes]).rstrip()
+    return tables
 
 
 def _maps_table(results: Mapping[str, MapsJudged]) -> Table:
@@ -72,7 +79,13 @@ def _surface(clouds: Mapping[str, SurfaceFigures | None], at: str) -> list[Cell]
     return [None] * 5
 
 
-def _not_judged(results: Mapping[str, MapsJudged]) -> Iterator[str]:
-    for name, judged in results.items():
-        for m in judged.maps:
-            yield from (f"{name}, map {m.map_id}: {why}\n" for why in (m.error, m.surface_error) if why)
+def not_judged(found: Mapping[str, Evaluation[DepthJudged | MapsJudged]]) -> list[str]:
+    """A line for each map that has no error of its own, with the reason."""
+    return [
+        f"{name}, map {m.map_id}: {why}\n"
+        for name, evaluation in found.items()
+        if isinstance(evaluation.judged, MapsJudged)
+        for m in evaluation.judged.maps
+        for why in (m.error, m.surface_error)
+        if why
+    ]

@@ -1,4 +1,4 @@
-"""What `lightdepth evaluate` writes: metrics.json, .md, .tex, .csv, cumulative error curves, error-coloured meshes.
+"""The tables of `lightdepth evaluate`, and the sentences below them.
 
 Tables 1 and 2 are laid out as the densification paper's: methods and metrics down, sequences across, their mean last.
 A table is headers and rows; the first `words` columns are text.
@@ -6,20 +6,15 @@ A table is headers and rows; the first `words` columns are text.
 
 from __future__ import annotations
 
-import csv
-import json
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from densify.evaluation.pictures import MODELS, curve_picture, error_picture, write_error_mesh
+from densify.evaluation.pictures import MODELS
 from densify.evaluation.records import (
-    EDGES_MM,
     DepthJudged,
     DistanceFigures,
     Evaluation,
@@ -28,11 +23,10 @@ from densify.evaluation.records import (
     Sources,
     SurfaceFigures,
     TrajectoryFigures,
-    metrics_record,
 )
 from densify.evaluation.suite import Suite, alone
 from densify.judging.withheld import WithheldOfMap
-from lightdepth.foreign_text import for_line, for_table
+from lightdepth.foreign_text import for_line
 from lightdepth.reporting.report import number
 
 _METRICS = {
@@ -272,19 +266,12 @@ def _row(
     return row
 
 
-# Files
-
-
-def write_evaluations(
+def tables_of(
     found: Mapping[str, Evaluation[DepthJudged | MapsJudged]],
-    folder: Path,
     withheld: Sequence[WithheldOfMap] = (),
-    sources: Sources | None = None,
     suite: Suite | None = None,
-) -> str:
-    """Everything, into the folder; the text of the tables, as metrics.md has it."""
-    record = metrics_record(found, withheld, sources)
-    (folder / "metrics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+) -> list[Table]:
+    """Every table that there is something for."""
     results = {name: e.judged for name, e in found.items()}
     depth = {name: j for name, j in results.items() if isinstance(j, DepthJudged)}
     posed = {name: j for name, j in results.items() if isinstance(j, MapsJudged)}
@@ -293,37 +280,12 @@ def write_evaluations(
         tables.append(trajectory_table(posed, suite))
     if any(j.pooled for j in posed.values()):
         tables += [surface_table(posed, suite), completeness_table(posed, suite)]
-    if withheld:
-        tables.append(withheld_table(withheld))
-    notes = _notes(results, None if sources is None else sources.gap)
-    notes += [f"{sources.made}.\n"] if sources is not None and sources.made else []
-    text = "\n".join([*(t.markdown() for t in tables), *notes])
-    (folder / "metrics.md").write_text(text.rstrip() + "\n", encoding="utf-8", errors="backslashreplace")
-    comments = "".join(f"% {line}\n" for note in notes for line in note.splitlines() if line)
-    (folder / "metrics.tex").write_text(
-        "\n".join([comments, *(t.latex() for t in tables)]), encoding="utf-8", errors="backslashreplace"
-    )
-    with (folder / "metrics.csv").open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
-        rows = long_rows(results)
-        csv.writer(file).writerows([for_table(v) if isinstance(v, str) else v for v in row] for row in rows)
-    for name, evaluation in found.items():
-        prefix = f"{name}_" if len(found) > 1 else ""
-        if evaluation.curves:
-            (folder / f"{prefix}cumulative_error.png").write_bytes(curve_picture(evaluation))
-            with (folder / f"{prefix}cumulative_error.csv").open(
-                "w", newline="", encoding="utf-8", errors="surrogateescape"
-            ) as file:
-                shares = np.stack(list(evaluation.curves.values()), 1)
-                rows = [[f"{v:.6g}" for v in (edge, *row)] for edge, row in zip(EDGES_MM, shares, strict=True)]
-                csv.writer(file).writerows([["error_mm", *evaluation.curves], *rows])
-        for mesh in evaluation.meshes:
-            write_error_mesh(mesh, folder / f"{prefix}{mesh.name}_error.ply")
-            (folder / f"{prefix}{mesh.name}_error.png").write_bytes(error_picture(mesh))
-    return text
+    return [*tables, withheld_table(withheld)] if withheld else tables
 
 
-def _notes(results: Mapping[str, DepthJudged | MapsJudged], gap: MapGap | None) -> list[str]:
+def notes_of(found: Mapping[str, Evaluation[DepthJudged | MapsJudged]], sources: Sources | None = None) -> list[str]:
     """Sentences below the tables: what the numbers mean, and which maps have none."""
+    results = {name: e.judged for name, e in found.items()}
     notes = []
     first = next(iter(results.values()), None)
     if isinstance(first, DepthJudged):
@@ -348,7 +310,10 @@ def _notes(results: Mapping[str, DepthJudged | MapsJudged], gap: MapGap | None) 
             notes.append(f"Alignment: {judged.alignment}. CLiMB: {judged.trajectory.climb_rule}.\n")
             if judged.trajectory.localised_share is None:
                 notes.append(f"Share of frames localised {judged.trajectory.localised_of}.\n")
-    return notes if gap is None else [*notes, gap_note(gap)]
+    if sources is not None:
+        notes += [] if sources.gap is None else [gap_note(sources.gap)]
+        notes += [f"{sources.made}.\n"] if sources.made else []
+    return notes
 
 
 def gap_note(gap: MapGap) -> str:
@@ -357,30 +322,3 @@ def gap_note(gap: MapGap) -> str:
         f"Maps {gap.first} and {gap.second}: gap median {gap.gap.median:.2%}, 90th percentile {gap.gap.p90:.2%} of "
         f"the distance to the camera, over {gap.gap.rays} rays.\n"
     )
-
-
-def long_rows(results: Mapping[str, DepthJudged | MapsJudged]) -> list[list[Cell]]:
-    """Headers and every single figure: sequence, frame or map (or mean, all), model, metric with its unit, value."""
-    rows: list[list[Cell]] = [["sequence", "part", "model", "metric", "value"]]
-
-    def add(name: str, part: str, model: str, figures: Mapping[str, object], prefix: str = "") -> None:
-        for metric, value in figures.items():
-            if isinstance(value, Mapping):
-                add(name, part, model, value, f"{prefix}{metric}_")
-            elif isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
-                rows.append([name, part, model, prefix + metric, value])
-
-    for name, judged in results.items():
-        if isinstance(judged, DepthJudged):
-            for frame, figures in {**judged.frames, "mean": judged.mean}.items():
-                add(name, frame, "", figures.record())
-            continue
-        add(name, "all", "", asdict(judged.trajectory))
-        parts: list[tuple[str, Mapping[str, object], Mapping[str, SurfaceFigures | None]]]
-        parts = [("all", {}, judged.pooled), *((f"map {m.map_id}", m.alone(), m.clouds) for m in judged.maps)]
-        for part, alone_figures, clouds in parts:
-            add(name, part, "", alone_figures)
-            for model in MODELS:
-                found = clouds.get(model)
-                add(name, part, model, {} if found is None else asdict(found))
-    return rows

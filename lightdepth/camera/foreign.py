@@ -118,7 +118,7 @@ def _fit(
         result: np.ndarray = plane * (fx, fy) + (cx, cy)
         return result
 
-    middle = np.degrees(theta) < 5
+    middle = theta <= max(np.radians(5), theta.min())  # an image cut out of a larger one may not hold its axis
     base = lens.pixels(rays[middle]) - lens.pixels(np.array([[0, 0, 1.0]]))
     slope = np.linalg.norm(base, axis=1).sum() / np.linalg.norm(rays[middle, :2], axis=1).sum()
     fx, fy, cx, cy = lens.focal

@@ -28,7 +28,7 @@ TEST_FILES = """
     robust radiosity losses decline frame
     alignment agreement agreement_mutants agreement_parts bending metrics refine relative_pose observations
     prediction trajectory marching_cubes tiny_fusion tiny_views trajectory_paths frozen second_core compiled
-    plain_fusion losses_by_hand camera_arrays
+    plain_fusion losses_by_hand camera_arrays highlights
 """
 
 

@@ -1,0 +1,82 @@
+"""report.html of `lightdepth evaluate`, and of benchmarks: tables, pictures, what they mean, and the files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from densify.evaluation.files import CURVES, prefix_of
+from densify.evaluation.in_short import not_judged, short_tables
+from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged, Sources
+from densify.evaluation.suite import Suite
+from densify.evaluation.tables import Table, notes_of, tables_of
+from densify.judging.withheld import WithheldOfMap
+from lightdepth.reporting.report import Report
+
+FILES = {
+    "metrics.md": "every table",
+    "metrics.tex": "the same as a paper has them",
+    "metrics.csv": "every figure, one a line",
+    "metrics.json": "every figure, for programs",
+    f"*{CURVES}.csv": "share of the surface within each error",
+    "*_error.ply": "the surface, coloured by its error",
+}
+
+_LONG = 120
+"""Characters of a title beyond which what stands after its colon becomes a sentence below it."""
+
+
+def tables_page(
+    title: str, said: Sequence[str], tables: Sequence[Table], pictures: Sequence[tuple[bytes, str]] = ()
+) -> Report:
+    """Sentences, pictures with captions (PNG), and tables."""
+    report = Report(title)
+    for sentence in said:
+        report.text(sentence)
+    if pictures:
+        report.heading("Pictures")
+        report.wide_figures(pictures)
+    _show(report, tables)
+    return report
+
+
+def evaluation_page(
+    found: Mapping[str, Evaluation[DepthJudged | MapsJudged]],
+    folder: Path,
+    withheld: Sequence[WithheldOfMap] = (),
+    sources: Sources | None = None,
+    suite: Suite | None = None,
+) -> Report:
+    """The page of an evaluation whose files write_evaluations has put into `folder`."""
+    report = Report("Errors against truth")
+    for line in not_judged(found):
+        report.text(line)
+    short = short_tables(found, withheld)
+    _show(report, short)
+    for name, evaluation in found.items():
+        prefix, of = prefix_of(name, found), f"{name}: " if len(found) > 1 else ""
+        pictures = []
+        if evaluation.curves:
+            caption = f"{of}share of the surface within each error"
+            pictures.append(((folder / f"{prefix}{CURVES}.png").read_bytes(), caption))
+        for mesh in evaluation.meshes:
+            caption = f"{of}{mesh.name}, coloured by its distance to the true surface"
+            pictures.append(((folder / f"{prefix}{mesh.name}_error.png").read_bytes(), caption))
+        if pictures:
+            report.heading(f"Where it errs{f', {name}' if len(found) > 1 else ''}")
+            report.wide_figures(pictures)
+    _show(report, [table for table in tables_of(found, withheld, suite) if table not in short])
+    report.heading("What the figures mean")
+    for note in notes_of(found, sources):
+        report.text(note)
+    report.files(folder, FILES)
+    return report
+
+
+def _show(report: Report, tables: Sequence[Table]) -> None:
+    for table in tables:
+        name, _, rest = table.title.partition(": ") if len(table.title) > _LONG else (table.title, "", "")
+        report.heading(name)
+        if rest:
+            report.text(f"{rest[0].upper()}{rest[1:]}")
+        report.table(table.headers, table.rows)
