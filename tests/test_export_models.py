@@ -19,7 +19,7 @@ from safetensors.torch import load_file, save_file
 from densify.evaluation.depth_files import DepthReading
 from lightdepth import from_pretrained
 from lightdepth.camera import KannalaBrandt
-from lightdepth.checkpoint import load_model, save_model
+from lightdepth.checkpoint import bundled, load_model, save_model
 from lightdepth.cli import main
 from lightdepth.datasets import write_folder
 from lightdepth.decline import log_closed_form
@@ -167,7 +167,7 @@ def test_a_graph_takes_images_and_batches_of_any_size(changes, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["lightdepth-synthetic", "lightdepth-self"])
+@pytest.mark.parametrize("name", bundled())
 def test_the_bundled_checkpoints_are_exported_for_any_size(name, tmp_path):
     for kind in ("onnx", "torch"):
         folder = export(name, tmp_path / kind, "--to", kind)

@@ -174,7 +174,7 @@ def test_predict_takes_the_factor_of_a_run_and_of_the_same_checkpoint_only(frame
     written = read_prediction(sorted((tmp_path / "out").glob("*.npz"))[0]).uncertainty
     assert np.median(written / plain) == pytest.approx(3.0, rel=0.02)
     assert json.loads((tmp_path / "out" / "run.json").read_text())["uncertainty_factor"] == 3.0
-    with refused(found="checkpoint lightdepth-synthetic"):
+    with refused(found=f"checkpoint {model.name}"):
         read_factor(run / "uncertainty.json", DeclineModel.name)
     (run / "uncertainty.json").write_text(json.dumps({"checkpoint": "decline", "factor": -1.0}))
     with refused(found="factor: -1"):

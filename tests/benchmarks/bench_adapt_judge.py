@@ -3,8 +3,9 @@ without a map: what was said and written, beside the true AbsRel of all frames, 
 
 Homes: 30 frames of 192x160 over 24 mm of a realistic colon, a plain one, a hollow that is none and a colon of another
 make, each through another lens, the light known. With a map: that of a simulated SLAM. Without: made by the program.
-Each also with the loss as the only teacher, held near the start and not, and with nothing that judges. LIGHTDEPTH_BENCH
-names a folder to keep what was made in.
+Each also with the loss as the only teacher, held near the start and not, and with nothing that judges.
+LIGHTDEPTH_BENCH names a folder to keep what was made in, LIGHTDEPTH_CHECKPOINT another start than the one that ships,
+LIGHTDEPTH_WAYS some of the ways alone, with semicolons between them.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from train.commands.adapt import adapt as adapt_verb
 
 adapt = by_options(adapt_verb)
 
+START = os.environ.get("LIGHTDEPTH_CHECKPOINT", DEFAULT_CHECKPOINT)
 SIZE, COUNT, TRAVEL, STEPS = (192, 160), 30, 24.0, 60
 HOMES = {
     "realistic": (9400, "pinhole"),
@@ -78,14 +80,17 @@ def test_what_is_written_is_not_worse_and_what_is_called_better_was_judged(kind,
         bare = [replace(f, true_distance=None, true_world_from_cam=None) for f in frames]
         write_folder(bare, kept / "frames")
         write_multimap(simulate_slam(frames, SLAM, HOMES[kind][0]).map, kept / "slam")
-    start = error(frames, load_model(DEFAULT_CHECKPOINT, details=False))
+    start = error(frames, load_model(START, details=False))
+    only = os.environ.get("LIGHTDEPTH_WAYS", "")
     for way, options in WAYS.items():
+        if only and way not in only.split(";"):
+            continue
         run = kept / way.replace(" ", "_").replace(",", "")
         given = {**options, "map": kept / "slam" if options.get("map") else None}
         if not run.exists():
             # Written in any case, so that what was refused can be judged as well.
             with suppress(PartialFailure):
-                adapt(kept / "frames", run, steps=STEPS, keep_worse=True, **given)
+                adapt(kept / "frames", run, steps=STEPS, keep_worse=True, checkpoint=START, **given)
         record = json.loads((run / "run.json").read_text())
         after = error(frames, load_model(str(run / "model.safetensors"), details=False))
         accepted = "--keep-worse" not in (run / "report.html").read_text().split("<h2>")[0]
