@@ -255,9 +255,9 @@ def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.
 
 @dataclass(frozen=True, repr=False)
 class DenseMapFiles(Brief):
-    """A dense map read back from its folder: the surface, the sparse points with their colours, the keyframes' frame
-    numbers and poses map_from_cam (n, 4, 4), and the map's camera; confidence, views, expected error and colour (n, 3)
-    uint8 of each vertex, where the file has them."""
+    """A dense map read back from its folder: the surface, the sparse points, which of them were used and which were
+    found wrong, the keyframes' frame numbers and poses map_from_cam (n, 4, 4), and the map's camera; confidence, views,
+    expected error and colour (n, 3) uint8 of each vertex, where the file has them."""
 
     id: int
     vertices: np.ndarray
@@ -271,6 +271,7 @@ class DenseMapFiles(Brief):
     views: np.ndarray | None = None
     expected_error: np.ndarray | None = None
     colors: np.ndarray | None = None
+    sparse_wrong: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -354,6 +355,7 @@ def _dense_map(folder: Path, map_id: int) -> DenseMapFiles:
         triangles=triangles,
         sparse=np.asarray(cloud.vertices, float),
         sparse_inlier=(np.asarray(cloud.colors)[:, :3] == GREEN).all(1),
+        sparse_wrong=(np.asarray(cloud.colors)[:, :3] == RED).all(1),
         numbers=numbers.round().astype(int),
         map_from_cam=poses,
         camera=read_camera(folder / "camera.json"),
