@@ -13,10 +13,13 @@ from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 
 
-def run_frames(source: Path, given: Path | None = None) -> tuple[FrameSequence | None, str]:
+def run_frames(
+    source: Path, given: Path | None = None, record: Mapping[str, object] | None = None
+) -> tuple[FrameSequence | None, str]:
     """The frames that were given, or those that a run names, under its own camera and mask; and where they are not
-    found, a sentence that says so, else an empty one. Raises InputError where they cannot be read."""
-    arguments = run_record(source).get("arguments")
+    found, a sentence that says so, else an empty one. `record` is in the place of a run.json that is not there yet.
+    Raises InputError where they cannot be read."""
+    arguments = (run_record(source) if record is None else record).get("arguments")
     named = arguments if isinstance(arguments, Mapping) else {}
     folder = map_folders(source)[0].parent
     beside = folder / "data" if (folder / "data").is_dir() else None  # where `demo` has them

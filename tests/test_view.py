@@ -306,6 +306,8 @@ def test_a_run_in_the_making_is_followed_from_before_its_first_map_to_its_end(tm
     frames, run = write_frames(tmp_path / CANARY), tmp_path / "run"
     made = unfinished_path(run)
     made.mkdir()
+    begun = {"verb": "live", "version": "0", "arguments": {"data": str(frames), "mm_per_unit": 2.0}, "inputs": {}}
+    (made / "begun.json").write_text(json.dumps(begun))
     with locked(run), another_process(), viewing(run) as shown:
         viewer = shown.viewer
         assert viewer.maps == {} and "No surface yet" in shown.panel.note.content
@@ -314,14 +316,15 @@ def test_a_run_in_the_making_is_followed_from_before_its_first_map_to_its_end(tm
             shown.made.follow(viewer)
         first = viewer.maps["map_000"]
         assert viewer.on["map_000"].value and "The run is at work" in shown.panel.note.content
-        assert not shown.panel.picture.visible and "units of the run" in viewer.known.unit
+        assert shown.panel.picture.visible and viewer.known.unit == "mm"
+        wait_until(lambda: all(camera.image is not None for camera in first.cameras.values()))
         shutil.copytree(write_run(tmp_path / "other", frames), made, dirs_exist_ok=True, copy_function=newer)
         os.rename(made, run)
         for _ in range(2):
             shown.made.follow(viewer)
-        assert viewer.maps["map_000"] is first and viewer.known.unit == "mm"
+        assert viewer.maps["map_000"] is first and viewer.known.unit == "mm" and not viewer.known.is_growing
         assert shown.panel.picture.visible and "at work" not in shown.panel.note.content
-        wait_until(lambda: all(camera.image is not None for camera in first.cameras.values()))
+        assert CANARY not in sent(shown.here)
 
 
 def newer(source: str, target: str) -> None:
@@ -354,6 +357,9 @@ def test_what_is_no_run_with_a_surface_is_refused(tmp_path):
         WatchedRun(tmp_path)
     unfinished_path(tmp_path / "stopped").mkdir()
     with refused(where="stopped", found="stopped before its first surface"):
+        WatchedRun(tmp_path / "stopped")
+    (unfinished_path(tmp_path / "stopped") / "begun.json").write_text('{"verb": "train"}')
+    with refused(where="stopped", found="made by `train`"):
         WatchedRun(tmp_path / "stopped")
     run = write_run(tmp_path / "run")
     (run / "map_000" / "mesh.ply").unlink()

@@ -24,6 +24,7 @@ from lightdepth.errors import InputError
 from lightdepth.reporting.scene import Surface
 
 _FOV = 2 * float(np.arctan(0.36))  # of a look from outside, up and down
+_AROUND = 1.08  # of what is looked at from outside, with a little room
 _WIDEST = 2.0  # radians, of a look from inside
 _WAY = (214, 40, 120)
 
@@ -215,15 +216,20 @@ class Viewer:
         if client is not None and self.maps:
             self._from_outside(client)
 
-    def _outside(self) -> tuple[Surface, np.ndarray, np.ndarray]:
-        """The surface that is looked at, the eye and the middle of it."""
-        surface = (self.shown() or [self.maps[self._best()]])[0].viewed.surface
-        low, high = surface.vertices.min(0), surface.vertices.max(0)
-        middle = (low + high) / 2
-        return surface, middle - 1.5 * extent(surface) * surface.axes[2], middle
+    def _outside(self, aspect: float = 1.0) -> tuple[Surface, np.ndarray, np.ndarray]:
+        """The surface that is looked at, the eye, and the middle of it with its cameras, which all fit in a window of
+        this width over height."""
+        drawn = (self.shown() or [self.maps[self._best()]])[0]
+        axes = drawn.viewed.surface.axes
+        places = np.concatenate([drawn.viewed.surface.vertices, drawn.centers]) @ axes.T
+        low, high = places.min(0), places.max(0)
+        half = (high - low) / 2
+        away = half[2] + _AROUND * max(half[0] / aspect, half[1]) / float(np.tan(_FOV / 2))
+        middle = axes.T @ ((low + high) / 2)
+        return drawn.viewed.surface, middle - away * axes[2], middle
 
     def _from_outside(self, client: viser.ClientHandle) -> None:
-        surface, eye, middle = self._outside()
+        surface, eye, middle = self._outside(max(client.camera.aspect, 0.1))
         with client.atomic():
             client.camera.position = eye
             client.camera.look_at = middle

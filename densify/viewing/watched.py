@@ -7,6 +7,7 @@ when its last keyframe is done. A folder that is still written to is read when i
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from lightdepth.errors import InputError
 from lightdepth.files.lock import is_live
 from lightdepth.files.replacing import unfinished_path
 from lightdepth.reporting.scene import Surface
+from lightdepth.reporting.unfinished import begun_with
 
 VERBS = ("densify", "live", "demo")
 """Whose runs have surfaces."""
@@ -56,6 +58,11 @@ class WatchedRun:
     def folder(self) -> Path:
         """Where its files are now."""
         return self._run if self.is_finished else self._made
+
+    @property
+    def record(self) -> Mapping[str, object]:
+        """run.json, or what a run that is still at work was begun with; empty where neither says anything."""
+        return run_record(self._run) if self.is_finished else begun_with(self._made) or {}
 
     def first(self) -> list[ViewedMap]:
         """The maps that there are. Raises InputError where one cannot be read, or where a finished run has none with a
@@ -113,7 +120,7 @@ class WatchedRun:
         run = self._run
         if not run.is_dir() and not self._made.is_dir():
             raise InputError(run, "not a folder" if run.exists() else "no such folder", _EXPECTED)
-        verb = run_record(run).get("verb") if self.is_finished else None
+        verb = self.record.get("verb")
         if verb is not None and verb not in VERBS:
             raise InputError(run, f"made by `{verb}`", _EXPECTED)
         if not map_folders(self.folder) and not (not self.is_finished and is_live(Path(os.path.abspath(run)))):

@@ -66,7 +66,7 @@ class Viewing:
         found, gone = self.watched.changed()
         if found or gone:
             viewer.put(found, gone)
-        if viewer.known.is_growing and self.watched.is_finished:
+        if viewer.known.is_growing and (found or self.watched.is_finished):
             viewer.tell(_known(self.watched, self.data, self.mm_per_unit))
 
     def _ready(self, here: Listening) -> None:
@@ -86,16 +86,13 @@ class Viewing:
 
 
 def _known(watched: WatchedRun, data: Path | None, mm_per_unit: float | None) -> Known:
-    """The unit of lengths, and the frames where they are found."""
+    """The unit of lengths, and the frames where they are found; none before there is a map."""
     growing, folder = not watched.is_finished, watched.folder
-    if growing and mm_per_unit is None:
-        unit = "units of the run, which says at its end what they are"
-    else:
-        unit = run_unit(folder, mm_per_unit)
-    if not map_folders(folder) or (growing and data is None):
-        return Known(unit, Pictures(), ("Pictures come when the run is finished.",), growing)
+    unit = _unit_meant(watched, mm_per_unit) if growing else run_unit(folder, mm_per_unit)
+    if not map_folders(folder):
+        return Known(unit, Pictures(), is_growing=growing)
     try:
-        frames, missing = run_frames(folder, data)
+        frames, missing = run_frames(folder, data, watched.record)
     except InputError as error:
         if data is not None:
             raise
@@ -104,3 +101,12 @@ def _known(watched: WatchedRun, data: Path | None, mm_per_unit: float | None) ->
         warnings.warn(f"{missing}: cameras have no pictures; give --data", stacklevel=2)
     notes = ("The run's frames are not there: cameras have no pictures.",) if missing else ()
     return Known(unit, Pictures(frames), notes, growing)
+
+
+def _unit_meant(watched: WatchedRun, mm_per_unit: float | None) -> str:
+    """As `run_unit`, of a run that is still at work."""
+    arguments = watched.record.get("arguments")
+    asked = isinstance(arguments, Mapping) and arguments.get("mm_per_unit") is not None
+    if asked and mm_per_unit is not None:
+        raise InputError(watched.folder, "its surfaces are in mm already", "leave --mm-per-unit out")
+    return "mm" if asked or mm_per_unit is not None else "map units"
