@@ -417,6 +417,6 @@ def test_the_verb_says_where_to_look_and_how_from_elsewhere_and_ends_on_ctrl_c(r
     if "--json" in words:
         found = json.loads(out)
         assert found["result"] == {"url": url, "port": port, "maps": ["map_000", "map_001"], "lengths": []}
-        assert found["exit_code"] == 130
+        assert found["exit_code"] == 130 and found["next"].startswith("lightdepth measure RUN")
     else:
         assert out == ""

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 from densify.scene import TRIANGLES
+from lightdepth.command_line.outcome import end
 from lightdepth.errors import InputError
 from lightdepth.ranges import above, at_least
+from lightdepth.signals import finishing_first
 
 
 def view(
@@ -37,4 +39,8 @@ def view(
         from densify.viewing.work import Viewing
     except ModuleNotFoundError as error:
         raise InputError("view", f"{error.name} is not installed", "pip install 'lightdepth[view]'") from error
-    Viewing.of(run, data, mm_per_unit, triangles).serve(host, port)
+    viewing = Viewing.of(run, data, mm_per_unit, triangles)
+    with finishing_first() as received:
+        viewing.serve(host, port, received)
+        end(then="lightdepth measure RUN --points '[[X, Y, Z], [X, Y, Z]]' -o lengths.json", result=viewing.result)
+        received.stop("nothing was written")

@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ from densify.viewing.ruler import Ruler
 from densify.viewing.viewer import Known, Viewer
 from densify.viewing.watched import ViewedMap, WatchedRun
 from lightdepth.command_line.heartbeat import at_work
-from lightdepth.command_line.outcome import outcome
+from lightdepth.command_line.outcome import Outcome, outcome
 from lightdepth.errors import InputError
-from lightdepth.signals import finishing_first
+from lightdepth.signals import Received
 
 POLL_S = 1.0
 """Seconds between two looks at the run's files."""
@@ -35,8 +36,8 @@ class Viewing:
     known: Known
     data: Path | None = None
     mm_per_unit: float | None = None
-    lengths: list[Mapping[str, Any]] = field(default_factory=list)
-    """what was measured, as `lightdepth measure` records it"""
+    result: dict[str, object] = field(default_factory=dict)
+    """where it was to be seen, its maps, and what was measured, as `lightdepth measure` records it"""
 
     @classmethod
     def of(cls, run: Path, data: Path | None, mm_per_unit: float | None, triangles: int) -> Viewing:
@@ -45,12 +46,13 @@ class Viewing:
             raise InputError(data, "no such file or folder", "give the frames that the run was made of")
         watched = WatchedRun(run, triangles)
         maps = tuple(watched.first())
-        return cls(watched, maps, _known(watched, data, mm_per_unit), data, mm_per_unit)
+        known = _known(watched, data, mm_per_unit)
+        return cls(watched, maps, known, data, mm_per_unit, {"maps": [m.name for m in maps], "lengths": []})
 
-    def serve(self, host: str, port: int) -> None:
-        """Until a signal comes. Raises InputError and MachineFailure as `local_server` does, Interrupted at the end."""
-        with local_server(host, port) as here, finishing_first() as received, at_work(lambda now: ""):
-            viewer = Viewer(here.server, self.known, Ruler(self.mm_per_unit or 1.0), self._measured)
+    def serve(self, host: str, port: int, received: Received) -> None:
+        """Until a signal is received. Raises InputError and MachineFailure as `local_server` does."""
+        with local_server(host, port) as here, at_work(lambda now: ""):
+            viewer = Viewer(here.server, self.known, Ruler(self.mm_per_unit or 1.0), partial(self._measured, outcome()))
             viewer.put(self.maps)
             self._ready(here)
             try:
@@ -59,7 +61,6 @@ class Viewing:
                     self.follow(viewer)
             finally:
                 viewer.close()
-            received.stop("nothing was written")
 
     def follow(self, viewer: Viewer) -> None:
         """Brings a viewer to what the run's files are now."""
@@ -71,7 +72,7 @@ class Viewing:
 
     def _ready(self, here: Listening) -> None:
         call = outcome()
-        call.result = {"url": here.url, "port": here.port, "maps": [m.name for m in self.maps], "lengths": self.lengths}
+        self.result.update(url=here.url, port=here.port)
         if not here.is_local:
             warnings.warn(f"anyone on the network can see the images at {here.url}", stacklevel=2)
         call.last(f"open {here.url}")
@@ -80,9 +81,12 @@ class Viewing:
             call.last(f"from another machine: {tunnel}, then open http://localhost:{here.port} there")
         print("Ctrl-C ends it.", flush=True)
 
-    def _measured(self, record: Mapping[str, Any], words: str) -> None:
-        self.lengths.append(record)
-        print(words, flush=True)
+    def _measured(self, call: Outcome, record: Mapping[str, Any], words: str) -> None:
+        """On a thread of the server, which does not know of which call it is."""
+        lengths = self.result["lengths"]
+        assert isinstance(lengths, list)
+        lengths.append(dict(record))
+        call.last(words)
 
 
 def _known(watched: WatchedRun, data: Path | None, mm_per_unit: float | None) -> Known:
