@@ -27,10 +27,12 @@ from densify.commands.measure import measure
 from lightdepth.errors import MachineFailure
 from lightdepth.files.lock import locked
 from lightdepth.files.replacing import unfinished_path
+from lightdepth.reporting.scene import Layer
 
 pytest.importorskip("viser", reason="needs the extra `view`")
 
 from densify.viewing.local_server import local_server
+from densify.viewing.panel import legend, lines
 from densify.viewing.viewer import Viewer
 from densify.viewing.watched import WatchedRun
 from densify.viewing.work import Viewing
@@ -242,6 +244,11 @@ def test_nothing_that_is_sent_names_the_patient_and_frames_that_are_gone_are_sai
     with pytest.warns(UserWarning, match=rf"frames are not found \(.*{CANARY}\).*--data"), viewing(run) as shown:
         assert not shown.panel.picture.visible and "cameras have no pictures" in shown.panel.note.content
         assert len(shown.viewer.maps["map_000"].cameras) == len(AT) and CANARY not in sent(shown.here)
+
+
+def test_a_name_is_shown_as_text_whatever_is_in_it():
+    assert "<img" not in lines("keyframe <img src=x onerror=alert(1)>.png") and "&lt;img" in lines("<img>")
+    assert "<i>" not in legend(Layer("", None, np.zeros((2, 3), np.uint8), ((0.0, "<i>"),)))
 
 
 def listening(process: int) -> list:
