@@ -187,6 +187,11 @@ def test_each_doubt_says_its_own_figure(aside, bent, share, why):
     assert room._doubt(Millimetres(1.0, 0.1, 0.1, 999, "", aside, bent), False, share) == why
 
 
+def test_a_wall_as_bright_as_any_that_is_tried_is_refused():
+    why = "a wall of reflectance 0.3 or more, or another response: the images do not say which"
+    assert room._doubt(Millimetres(1.0, 0.1, 0.3, 999, "", 0.0, 0.0), False, 0.1) == why
+
+
 def test_a_cost_that_is_flat_is_refused_and_one_that_is_not_is_told():
     told = Millimetres(1.0, 0.1, 0.1, 999, "", 0.0, 0.0)
     flat = "shading hardly changes with the scale: the light's offset is 10.0% of the distance"

@@ -134,6 +134,8 @@ def _doubt(told: Millimetres, flat: bool, share: float) -> str:
         return f"the light shines from elsewhere: the images put it {angle:.0f} degrees around the axis from its place"
     if abs(told.bent) > _BENT:
         return f"the response does not fit: the images' gamma is {1 / (1 + told.bent):.2f} times the light's"
+    if told.reflectance >= _FINE[0][-1]:
+        return f"a wall of reflectance {told.reflectance:g} or more, or another response: the images do not say which"
     if flat:
         return f"shading hardly changes with the scale: the light's offset is {share:.1%} of the distance"
     return ""
