@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -20,12 +20,12 @@ from lightdepth.brief import Brief
 from lightdepth.calibration import read_camera, write_camera
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
-from lightdepth.files.meshes import load_mesh
+from lightdepth.files.meshes import load_mesh, vertex_columns
 from lightdepth.files.named_inputs import with_real_inputs
 from lightdepth.files.reading import reading
 from lightdepth.files.schema import read_json
 from lightdepth.files.tum import read_tum, write_tum
-from lightdepth.foreign_text import for_table
+from lightdepth.foreign_text import for_table, from_table
 from lightdepth.sparse_map import Keyframe, Submap
 
 GREEN, RED, GREY = (0, 170, 60), (220, 30, 30), (150, 150, 150)
@@ -255,9 +255,9 @@ def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.
 
 @dataclass(frozen=True, repr=False)
 class DenseMapFiles(Brief):
-    """A dense map read back from its folder: the surface, the sparse points with their colours, the keyframes' frame
-    numbers and poses map_from_cam (n, 4, 4), and the map's camera; confidence, views and expected error of each vertex,
-    where the file has them."""
+    """A dense map read back from its folder: the surface, the sparse points, which of them were used and which were
+    found wrong, the keyframes' frame numbers and poses map_from_cam (n, 4, 4), and the map's camera; confidence, views,
+    expected error and colour (n, 3) uint8 of each vertex, where the file has them."""
 
     id: int
     vertices: np.ndarray
@@ -270,6 +270,36 @@ class DenseMapFiles(Brief):
     confidence: np.ndarray | None = None
     views: np.ndarray | None = None
     expected_error: np.ndarray | None = None
+    colors: np.ndarray | None = None
+    sparse_wrong: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class KeyframeRow:
+    """A keyframe as keyframes.csv has it: its name, whether it is in the surface, and the reason where it is not."""
+
+    name: str
+    used: bool = True
+    reason: str = ""
+
+
+def read_keyframes(folder: Path, numbers: Sequence[int]) -> list[KeyframeRow]:
+    """The rows of keyframes.csv for frames of these numbers. Where the table is gone, numbers are names. Raises
+    InputError where one has no row."""
+    path = folder / "keyframes.csv"
+    if not path.is_file():
+        return [KeyframeRow(f"{int(n):06d}") for n in numbers]
+    with reading(path, "a table of keyframes"), path.open(encoding="utf-8", newline="") as file:
+        found = {
+            int(row["frame"]): KeyframeRow(
+                from_table(row["keyframe"]), row.get("ok", "1") == "1", from_table(row.get("reason") or "")
+            )
+            for row in csv.DictReader(file)
+        }
+    if missing := [n for n in numbers if n not in found]:
+        cure = "copy it again from the run, or leave it out: then numbers are names"
+        raise InputError(path, f"no row for frame {missing[0]}, which is in the trajectory beside it", cure)
+    return [found[int(n)] for n in numbers]
 
 
 def map_folders(path: Path) -> list[Path]:
@@ -277,6 +307,12 @@ def map_folders(path: Path) -> list[Path]:
     if (path / "mesh.ply").is_file() and (path / "trajectory.tum").is_file():
         return [path]
     return sorted(p for p in path.glob("map_*") if p.is_dir()) if path.is_dir() else []
+
+
+def surface_folders(path: Path) -> list[Path]:
+    """The map folders of a densify run, then those of its joined surfaces; or the folder itself where it is one."""
+    found = map_folders(path)
+    return found if found == [path] else found + sorted(p for p in path.glob("joined_*") if p.is_dir())
 
 
 def run_record(path: Path) -> Mapping[str, object]:
@@ -312,22 +348,25 @@ def _dense_map(folder: Path, map_id: int) -> DenseMapFiles:
     mesh, cloud = _read_ply(folder / "mesh.ply"), _read_ply(folder / "sparse.ply")
     triangles = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), int)
     numbers, poses = read_tum(folder / "trajectory.tum")
-    # trimesh keeps what it has no name for in the raw file: a structured array, or a dict of columns
-    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {}) if len(triangles) else {}
-    names = raw.dtype.names if isinstance(raw, np.ndarray) else tuple(raw)
-    wanted = ("confidence", "views", "expected_error")
-    own = {name: np.asarray(raw[name]).ravel() if name in names else None for name in wanted}
+    own = vertex_columns(mesh, ("confidence", "views", "expected_error")) if len(triangles) else {}
     return DenseMapFiles(
         id=map_id,
         vertices=np.asarray(getattr(mesh, "vertices", np.zeros((0, 3))), float),  # an empty mesh is read as a scene
         triangles=triangles,
         sparse=np.asarray(cloud.vertices, float),
         sparse_inlier=(np.asarray(cloud.colors)[:, :3] == GREEN).all(1),
+        sparse_wrong=(np.asarray(cloud.colors)[:, :3] == RED).all(1),
         numbers=numbers.round().astype(int),
         map_from_cam=poses,
         camera=read_camera(folder / "camera.json"),
+        colors=_colors(mesh, len(triangles)),
         **own,
     )
+
+
+def _colors(mesh: Any, triangles: int) -> np.ndarray | None:
+    found = getattr(mesh.visual, "vertex_colors", None) if triangles else None  # one with a texture has none
+    return None if found is None or len(found) != len(mesh.vertices) else np.asarray(found)[:, :3].astype(np.uint8)
 
 
 def _read_ply(path: Path) -> Any:

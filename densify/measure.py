@@ -310,10 +310,17 @@ class Measured:
         return text
 
 
-def measured(dense: DenseMapFiles, places: np.ndarray, radius: float | None = None, scale: float = 1.0) -> Measured:
+def measured(
+    dense: DenseMapFiles,
+    places: np.ndarray,
+    radius: float | None = None,
+    scale: float = 1.0,
+    wall: Wall | None = None,
+) -> Measured:
     """What one place and a radius (an area), two places (a length), or an outline of more (both) measure.
 
-    `scale` multiplies lengths at the end; radius is in the scaled unit. Raises InputError for anything else.
+    `scale` multiplies lengths at the end; radius is in the scaled unit; `wall` is the map's, where it was made before.
+    Raises InputError for anything else.
     """
     if not np.isfinite(places).all():
         raise InputError("places", f"{places.tolist()}", "expected finite numbers")
@@ -325,7 +332,7 @@ def measured(dense: DenseMapFiles, places: np.ndarray, radius: float | None = No
         )
     if radius is not None and not (radius > 0 and np.isfinite(radius)):
         raise InputError("--radius", f"{radius}", "expected a positive length")
-    wall = Wall(dense.vertices, dense.triangles)
+    wall = wall or Wall(dense.vertices, dense.triangles)
     places = on_wall(wall, places)
     found: Way | Area
     if len(places) == 2:

@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from densify.coverage import seen_well
-from densify.dense_map import GREEN, GREY, RED, DenseMap
+from densify.dense_map import GREEN, GREY, RED, DenseMap, DenseMapFiles, KeyframeRow
 from densify.evaluation.pictures import FARTHEST_COLOR_MM, error_colors
 from densify.predictions import SeenKeyframe
 from lightdepth.camera import CameraModel
@@ -19,6 +19,8 @@ from lightdepth.sparse_map import SparseMap
 SEEN_WELL, SEEN_WEAKLY, DOUBTFUL = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15), (0.8, 0.15, 0.15)
 TRUSTED = 0.2
 """Confidence below which wall is red: it is expected to be off by twice what is doubted."""
+MANY = 9
+"""Keyframes that saw a piece of wall from which on its colour stays the same."""
 
 SURFACE_FILES = {
     "map_*/mesh.*": "the surface",
@@ -76,11 +78,15 @@ def surface_of(title: str, dense: DenseMap, distance: np.ndarray | None = None) 
         Cloud("Points not judged", points[~judged], GREY),
     )
     keyframes = dense.submap.keyframes
+    layers = [*_looks(dense.colors), *_confidence(dense.confidence)]
+    if (kinds := seen_kinds(dense)) is not None:
+        marks = ((0.0, "seen well"), (0.5, "seen weakly"), (1.0, f"confidence below {TRUSTED}"))
+        layers.append(Layer("How well seen", kinds, _bytes(KINDS), marks))
     return Surface(
         title,
         dense.vertices,
         dense.triangles,
-        _layers(dense, distance),
+        (*layers, *_error(distance, len(dense.vertices))),
         tuple(cloud for cloud in clouds if len(cloud.points)),
         tuple(Pose(k.name, k.cam_from_map, a.ok) for k, a in zip(keyframes, dense.alignments, strict=True)),
         tangents(keyframes[len(keyframes) // 2].camera),
@@ -88,24 +94,61 @@ def surface_of(title: str, dense: DenseMap, distance: np.ndarray | None = None) 
     )
 
 
-def _layers(dense: DenseMap, distance: np.ndarray | None) -> tuple[Layer, ...]:
-    """Colours, shape, and as far as they are known: confidence, how well it was seen, and error."""
-    layers = [
-        Layer("Of the images", _bytes(dense.colors)),
+def surface_of_files(
+    title: str, read: DenseMapFiles, keyframes: Sequence[KeyframeRow], distance: np.ndarray | None = None
+) -> Surface:
+    """As `surface_of`, for what was read back from a map folder: in the place of how well it was seen, which also hangs
+    on weights that no file has, by how many keyframes."""
+    wrong = np.zeros(len(read.sparse), bool) if read.sparse_wrong is None else read.sparse_wrong
+    clouds = (
+        Cloud("Points used", read.sparse[read.sparse_inlier], GREEN),
+        Cloud("Points found wrong", read.sparse[wrong], RED),
+        Cloud("Points not judged", read.sparse[~(read.sparse_inlier | wrong)], GREY),
+    )
+    colors = np.broadcast_to(_bytes(np.array([PLAIN])), (len(read.vertices), 3))
+    layers = [*_looks((colors if read.colors is None else read.colors) / 255), *_confidence(read.confidence)]
+    if read.views is not None:
+        marks = ((0.0, "seen by 1 keyframe"), (0.5, f"{(MANY + 1) // 2}"), (1.0, f"{MANY} and more"))
+        steps = np.clip((read.views - 1) / (MANY - 1), 0, 1)
+        layers.append(
+            Layer("Keyframes that saw it", _bytes(steps), _bytes(level_colors(np.linspace(0, 1, 256))), marks)
+        )
+    poses = zip(keyframes, read.map_from_cam, strict=True)
+    return Surface(
+        title,
+        read.vertices,
+        read.triangles,
+        (*layers, *_error(distance, len(read.vertices))),
+        tuple(cloud for cloud in clouds if len(cloud.points)),
+        tuple(Pose(row.name, np.linalg.inv(pose), row.used) for row, pose in poses),
+        tangents(read.camera),
+        outside_axes(read.vertices) if len(read.vertices) else np.eye(3),
+    )
+
+
+def _looks(colors: np.ndarray) -> list[Layer]:
+    """The colours of the images (n, 3) in [0, 1], and the shape without them."""
+    return [
+        Layer("Of the images", _bytes(colors)),
         Layer("Shape alone", None, _bytes(np.array([PLAIN]))),
     ]
-    shades = np.linspace(0, 1, 256)
-    if dense.confidence is not None:
-        marks = ((0.0, "confidence 0"), (0.5, "0.5"), (1.0, "1"))
-        layers.append(Layer("Confidence", _bytes(dense.confidence), _bytes(level_colors(shades)), marks))
-    if (kinds := seen_kinds(dense)) is not None:
-        marks = ((0.0, "seen well"), (0.5, "seen weakly"), (1.0, f"confidence below {TRUSTED}"))
-        layers.append(Layer("How well seen", kinds, _bytes(KINDS), marks))
-    if distance is not None and len(distance) == len(dense.vertices):
-        far = FARTHEST_COLOR_MM
-        marks = ((0.0, "off by 0 mm"), (0.5, f"{far / 2:g} mm"), (1.0, f"{far:g} mm and more"))
-        layers.append(Layer("Error", _bytes(distance / far), _bytes(error_colors(far * shades)), marks))
-    return tuple(layers)
+
+
+def _confidence(confidence: np.ndarray | None) -> list[Layer]:
+    """Where it is known."""
+    if confidence is None:
+        return []
+    marks = ((0.0, "confidence 0"), (0.5, "0.5"), (1.0, "1"))
+    return [Layer("Confidence", _bytes(confidence), _bytes(level_colors(np.linspace(0, 1, 256))), marks)]
+
+
+def _error(distance: np.ndarray | None, count: int) -> list[Layer]:
+    """Distance (n,) [mm] from the truth, where it is that of the vertices, of which there are `count`."""
+    if distance is None or len(distance) != count:
+        return []
+    far = FARTHEST_COLOR_MM
+    marks = ((0.0, "off by 0 mm"), (0.5, f"{far / 2:g} mm"), (1.0, f"{far:g} mm and more"))
+    return [Layer("Error", _bytes(distance / far), _bytes(error_colors(far * np.linspace(0, 1, 256))), marks)]
 
 
 def _bytes(shares: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ TRAIN = f"train {OUT} --data.sequences HERE/frames"
 CONVERT = f"convert-camera HERE/camera/camera.json {OUT}"
 EVALUATE = f"evaluate HERE/predictions --truth {DATA} {OUT}"
 MEASURE = "measure HERE/dense"
+VIEW = "view HERE/dense"
 
 MORE = [
     # ---- numbers out of range
@@ -217,6 +218,20 @@ MORE = [
     Command(f"{MEASURE}", words="--points"),
     Command("measure HERE/nowhere --points [[0,0,30],[1,1,30]]", words="nowhere"),
     Command("measure HERE/predictions --points [[0,0,30],[1,1,30]]", words="predictions"),
+    Command("view HERE/nowhere", words="nowhere: no such folder"),
+    Command("view HERE/predictions", words="made by `predict`"),
+    Command("view HERE/bad/folder", words="folder"),
+    Command("view HERE/bad/text.txt", words="not a folder"),
+    Command("view", 2, "missing: RUN"),
+    Command(f"{VIEW} --port 65536", words="--port: 65536"),
+    Command(f"{VIEW} --port http", 2, "--port"),
+    Command(f"{VIEW} --host 192.0.2.1", words="--host: nothing can listen there"),
+    Command(f"{VIEW} --host http://x", words="--host: 'http://x' is no host"),
+    Command(f"{VIEW} --data HERE/nowhere", words="nowhere: no such file or folder"),
+    Command(f"{VIEW} --data HERE/bad/folder", words="folder"),
+    Command(f"{VIEW} --mm-per-unit 0", words="--mm-per-unit: 0"),
+    Command(f"{VIEW} --triangles 3", words="--triangles: 3"),
+    Command(f"{VIEW} {OUT}", 2, "no option -o"),
     Command(f"export HERE/dense {OUT}", 2, "--to"),
     Command(f"export HERE/dense {OUT} --to stl", 2, "--to"),
     Command(f"export HERE/nowhere {OUT} --to colmap", words="nowhere"),

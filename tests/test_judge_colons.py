@@ -192,6 +192,15 @@ def test_frames_have_distance_wherever_their_mask_shows_wall_and_walls_reflect_w
     assert brightest.mean() == pytest.approx(0.5, abs=0.15)
 
 
+def test_lamps_that_are_given_take_the_place_of_those_drawn_and_the_way_stays():
+    lamp = Lamp((5.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    made = judge_frames(SMALL, quality=1, lamps=[lamp])
+    for one, before in zip(made, small(), strict=True):
+        assert one.frame.light.position_mm == (5.0, 0.0, 0.0) != before.frame.light.position_mm
+        np.testing.assert_array_equal(one.frame.true_world_from_cam, before.frame.true_world_from_cam)
+    np.testing.assert_array_equal(made[0].frame.true_distance, small()[0].frame.true_distance)
+
+
 def test_the_judge_knows_nothing_of_what_trains():
     folder = Path(__file__).parents[1] / "lightdepth" / "judge_colons"
     for path in folder.glob("*.py"):

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from densify.evaluation.records import EDGES_MM, DepthJudged, ErrorMesh, Evaluation, MapsJudged
+from lightdepth.files.meshes import load_mesh, vertex_columns
 from lightdepth.reporting.figures import MeshView, chart, chart_png, png, side_by_side
 
 MODELS = {"sparse": "Sparse map", "sparse_inliers": "Sparse inliers", "dense": "Dense"}
@@ -48,6 +49,11 @@ def write_error_mesh(mesh: ErrorMesh, path: Path) -> None:
     made = trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=colors, process=False)
     made.vertex_attributes["error_mm"] = mesh.distance.astype(np.float32)
     made.export(path)
+
+
+def read_error(path: Path) -> np.ndarray | None:
+    """The distances (n,) [mm] that `write_error_mesh` wrote; None where the file is not there, or has none."""
+    return vertex_columns(load_mesh(path), ["error_mm"])["error_mm"] if path.is_file() else None
 
 
 def error_picture(mesh: ErrorMesh) -> bytes:

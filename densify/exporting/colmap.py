@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from densify.exporting.exported import Exportable
-from densify.exporting.images import frame_of, known_cameras, pinhole_of, seen_by, write_image
+from densify.exporting.images import known_cameras, pinhole_of, seen_by, write_image
+from densify.run_frames import frame_of
 from lightdepth.datasets import FrameSequence
 from lightdepth.files.reading import reading
 from lightdepth.maps.colmap import write_text_model

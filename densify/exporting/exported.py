@@ -3,7 +3,6 @@ and what they see of the surface."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,14 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from densify.dense_map import DenseMapFiles, Surface, map_folders, read_dense_map, run_record
+from densify.dense_map import (
+    DenseMapFiles,
+    Surface,
+    map_folders,
+    read_dense_map,
+    read_keyframes,
+    run_record,
+    surface_folders,
+)
 from densify.inputs import fitted_to_frames
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.below import given
 from lightdepth.files.meshes import load_mesh
 from lightdepth.files.reading import reading
-from lightdepth.foreign_text import from_table
 from lightdepth.geometry import depth_from_distance
 from lightdepth.maps import read_map
 from lightdepth.maps.endocartoscope import TrajectoryPose, read_trajectory, trajectory_path
@@ -78,10 +84,9 @@ def read_exportables(run: Path, sparse: Path | None = None) -> list[Exportable]:
     What keyframes observed is read from `sparse`, else from the map that the run itself names, where it is still there.
     Raises InputError where there is no dense map, or where `sparse` is not the map that the run was made of.
     """
-    folders = map_folders(run)
-    if not folders:
+    folders = surface_folders(run)
+    if not map_folders(run):
         raise InputError(run, "no map_* folders in it", "expected a densify run, or one of its map folders")
-    folders += [] if folders == [run] else sorted(p for p in run.glob("joined_*") if p.is_dir())
     record = run_record(run)
     path = sparse or _map_of(folders[0].parent, record)
     submaps = {} if path is None else _submaps(path, folders[0], record)
@@ -104,12 +109,13 @@ def _exportable(
             raise InputError(given, f"not the map that {folder.name} was made of", "give that map, or leave it out")
         submap = None
     unit = record.get("unit")
-    colors, normals = _looks(folder / "mesh.ply", len(dense.vertices))
+    if dense.colors is None:
+        raise InputError(folder / "mesh.ply", "no colours of its vertices", "expected one each")
     return Exportable(
         name=folder.name,
         dense=dense,
-        colors=colors,
-        normals=normals,
+        colors=dense.colors,
+        normals=_normals(folder / "mesh.ply"),
         submap=submap or _without_observations(folder, dense),
         tracked=submap is not None,
         unit=unit if isinstance(unit, str) else "map units",
@@ -176,28 +182,16 @@ def _is_of(submap: Submap, dense: DenseMapFiles) -> bool:
 
 def _without_observations(folder: Path, dense: DenseMapFiles) -> Submap:
     """Keyframes as the run's files have them: names, camera, poses. Where their table is gone, numbers are names."""
-    names, path = {int(n): f"{int(n):06d}" for n in dense.numbers}, folder / "keyframes.csv"
-    if path.is_file():
-        with reading(path, "a table of keyframes"), path.open(encoding="utf-8", newline="") as file:
-            found = {int(row["frame"]): from_table(row["keyframe"]) for row in csv.DictReader(file)}
-        if missing := [n for n in names if n not in found]:
-            cure = "copy it again from the run, or leave it out: then numbers are names"
-            raise InputError(path, f"no row for frame {missing[0]}, which is in the trajectory beside it", cure)
-        names |= found
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     keyframes = tuple(
-        Keyframe(names[int(n)], dense.camera, np.linalg.inv(pose), *none)
-        for n, pose in zip(dense.numbers, dense.map_from_cam, strict=True)
+        Keyframe(row.name, dense.camera, np.linalg.inv(pose), *none)
+        for row, pose in zip(read_keyframes(folder, dense.numbers.tolist()), dense.map_from_cam, strict=True)
     )
     return Submap(dense.id, keyframes, np.arange(1, len(dense.sparse) + 1), dense.sparse)
 
 
-def _looks(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (n, 3) uint8 and unit normals (n, 3) of a mesh file's vertices."""
+def _normals(path: Path) -> np.ndarray:
+    """Unit normals (n, 3) of a mesh file's vertices."""
     mesh: Any = load_mesh(path)
-    with reading(path, "a mesh with colours"):
-        colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(np.uint8)
-        normals = np.asarray(mesh.vertex_normals, float)
-    if len(colors) != count:
-        raise InputError(path, f"{len(colors)} colours of {count} vertices", "expected one each")
-    return colors, normals
+    with reading(path, "a mesh with normals"):
+        return np.asarray(mesh.vertex_normals, float)

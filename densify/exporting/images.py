@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,19 +10,7 @@ import numpy as np
 
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.camera_conversion import convert_camera
-from lightdepth.datasets import FrameSequence
-from lightdepth.errors import InputError
 from lightdepth.files import images
-from lightdepth.frame import Frame
-
-
-def frame_of(frames: FrameSequence | None, number: int) -> Frame | None:
-    """The frame with this number; None where there is none, or it cannot be read, which is warned of."""
-    try:
-        return None if frames is None else frames.by_number(number)
-    except InputError as error:
-        warnings.warn(f"without its picture: {error}", stacklevel=2)
-        return None
 
 
 def known_camera(camera: CameraModel, names: tuple[str, ...], instead: str) -> tuple[CameraModel, str]:

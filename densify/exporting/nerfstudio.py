@@ -16,7 +16,8 @@ import numpy as np
 from densify.dense_map import write_cloud
 from densify.exporting.colmap import stem
 from densify.exporting.exported import Exportable
-from densify.exporting.images import frame_of, known_cameras, write_image
+from densify.exporting.images import known_cameras, write_image
+from densify.run_frames import frame_of
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 

@@ -10,13 +10,12 @@ from typing import Annotated, Literal
 from densify.dense_map import map_folders, run_record
 from densify.exporting.colmap import write_colmap
 from densify.exporting.exported import Exportable, read_exportables
-from densify.exporting.images import frame_of
 from densify.exporting.meshes import write_mesh, write_surfaces
 from densify.exporting.nerfstudio import write_nerfstudio
 from densify.exporting.trees import write_climb, write_trajectory
-from lightdepth.calibration import read_camera
+from densify.run_frames import frame_of, run_frames
 from lightdepth.counting import counted
-from lightdepth.datasets import FORMATS, FrameSequence, open_sequence
+from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.ranges import ANY, at_least, checked
 from lightdepth.reporting.progress import Progress
@@ -107,22 +106,11 @@ def _keep_origin(run: Run, source: Path, name: str) -> None:
 
 
 def _frames(run: Run, source: Path, given: Path | None) -> FrameSequence | None:
-    """The frames that a run was made of: those given, or those that it names, where they are still there."""
-    arguments = run_record(source).get("arguments")
-    named = arguments if isinstance(arguments, Mapping) else {}
-    folder = map_folders(source)[0].parent
-    beside = folder / "data" if (folder / "data").is_dir() else None  # where `demo` has them
-    path = given or (Path(str(named["data"])) if named.get("data") else beside)
-    if path is None or not path.exists():
-        run.warn(
-            f"the run's frames are not found{f' ({path})' if path else ''}: no pictures, times or masks; give --data"
-        )
-        return None
-    own = {key: Path(str(named[key])) for key in ("camera", "mask") if named.get(key)}
-    own = {key: file for key, file in own.items() if file.exists()}
-    known = next((name for name in FORMATS if name == named.get("format")), None)
-    camera = None if "camera" in own else read_camera(map_folders(source)[0] / "camera.json")
-    return open_sequence(path, known, own.get("camera"), None, own.get("mask"), camera)
+    """The frames that a run was made of, where they are found; a warning where they are not."""
+    frames, missing = run_frames(source, given)
+    if missing:
+        run.warn(f"{missing}: no pictures, times or masks; give --data")
+    return frames
 
 
 def _times(frames: FrameSequence | None, maps: list[Exportable]) -> dict[int, float]:

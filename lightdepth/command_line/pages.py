@@ -171,6 +171,12 @@ PAGES = {
             "lightdepth measure runs/dense --frame 120 --pixels '[[310, 200], [420, 260]]'",
         )
     ),
+    "view": Page(
+        (
+            "lightdepth view runs/dense",
+            "lightdepth view runs/live --port 8090 --data DATA",
+        )
+    ),
     "completion": Page(
         (
             "lightdepth completion bash > ~/.local/share/bash-completion/completions/lightdepth",

@@ -35,6 +35,7 @@ ORDER = (
     "evaluate",
     "bench",
     "measure",
+    "view",
     "export",
     "completion",
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,14 @@ def load_mesh(
     with reading(path, what, cure):
         options: dict[str, Any] = {"force": "mesh", "skip_materials": True} if triangles_alone else {}
         return trimesh.load(io.BytesIO(data), file_type=kind, process=False, **options)
+
+
+def vertex_columns(mesh: Any, names: Iterable[str]) -> dict[str, np.ndarray | None]:
+    """Columns (n,) of a PLY's vertices that trimesh has no name for, by name; None where the file has none."""
+    # It keeps them in the raw file: a structured array, or a dict of columns.
+    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    there = raw.dtype.names if isinstance(raw, np.ndarray) else tuple(raw)
+    return {name: np.asarray(raw[name]).ravel() if name in there else None for name in names}
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:

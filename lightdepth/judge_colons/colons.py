@@ -6,7 +6,7 @@ pictures of them raises VERSION, and figures of two versions are not comparable.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,7 +15,7 @@ import numpy as np
 from lightdepth.camera import CameraModel
 from lightdepth.frame import Frame
 from lightdepth.judge_colons.endoscope import Exposure, LensKind, Sensor, draw_way, exposed, image_circle, make_lens
-from lightdepth.judge_colons.lamps import draw_lamps, measured_light, vignetting
+from lightdepth.judge_colons.lamps import Lamp, draw_lamps, measured_light, vignetting
 from lightdepth.judge_colons.skin import make_skin
 from lightdepth.judge_colons.transport import (
     Hits,
@@ -88,13 +88,20 @@ class _View:
     reflectance: np.ndarray
 
 
-def judge_frames(colon: JudgeColon, progress: Callable[[], None] = lambda: None, quality: int = 10) -> list[JudgeFrame]:
-    """The frames of a colon; `quality`² paths are drawn for each place where indirect light is found."""
+def judge_frames(
+    colon: JudgeColon,
+    progress: Callable[[], None] = lambda: None,
+    quality: int = 10,
+    lamps: Sequence[Lamp] | None = None,
+) -> list[JudgeFrame]:
+    """The frames of a colon; `quality`² paths are drawn for each place where indirect light is found. Lamps that are
+    given take the place of those that are drawn, and leave wall, lens and way as they are."""
     rng = np.random.default_rng([VERSION, colon.seed])
     wall = make_wall(rng)
     scene = Scene(wall.mesh, make_skin(rng, colon.reflectance))
     camera = make_lens(colon.lens, *colon.size, rng)
-    lamps, vignette = draw_lamps(rng), float(rng.uniform(0.0, 1.6))
+    drawn, vignette = draw_lamps(rng), float(rng.uniform(0.0, 1.6))
+    lamps = drawn if lamps is None else lamps
     sensor = Sensor(
         colon.exposure,
         colon.gamma,

@@ -1,0 +1,116 @@
+"""A viewer at work: a run is read, served, and followed until a signal ends it."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from densify.dense_map import map_folders
+from densify.measure import run_unit
+from densify.run_frames import run_frames
+from densify.viewing.local_server import Listening, local_server
+from densify.viewing.pictures import Pictures
+from densify.viewing.ruler import Ruler
+from densify.viewing.viewer import Known, Viewer
+from densify.viewing.watched import ViewedMap, WatchedRun
+from lightdepth.command_line.heartbeat import at_work
+from lightdepth.command_line.outcome import Outcome, outcome
+from lightdepth.errors import InputError
+from lightdepth.signals import Received
+
+POLL_S = 1.0
+"""Seconds between two looks at the run's files."""
+
+
+@dataclass(frozen=True)
+class Viewing:
+    """A run that is to be shown, as it was when it was first read."""
+
+    watched: WatchedRun
+    maps: tuple[ViewedMap, ...]
+    known: Known
+    data: Path | None = None
+    mm_per_unit: float | None = None
+    result: dict[str, object] = field(default_factory=dict)
+    """where it was to be seen, its maps, and what was measured, as `lightdepth measure` records it"""
+
+    @classmethod
+    def of(cls, run: Path, data: Path | None, mm_per_unit: float | None, triangles: int) -> Viewing:
+        """Raises InputError where there is nothing to show."""
+        if data is not None and not data.exists():
+            raise InputError(data, "no such file or folder", "give the frames that the run was made of")
+        watched = WatchedRun(run, triangles)
+        maps = tuple(watched.first())
+        known = _known(watched, data, mm_per_unit)
+        return cls(watched, maps, known, data, mm_per_unit, {"maps": [m.name for m in maps], "lengths": []})
+
+    def serve(self, host: str, port: int, received: Received) -> None:
+        """Until a signal is received. Raises InputError and MachineFailure as `local_server` does."""
+        with local_server(host, port) as here, at_work(lambda now: ""):
+            viewer = Viewer(here.server, self.known, Ruler(self.mm_per_unit or 1.0), partial(self._measured, outcome()))
+            viewer.put(self.maps)
+            self._ready(here)
+            try:
+                while not received.signal:
+                    time.sleep(POLL_S)
+                    self.follow(viewer)
+            finally:
+                viewer.close()
+
+    def follow(self, viewer: Viewer) -> None:
+        """Brings a viewer to what the run's files are now."""
+        found, gone = self.watched.changed()
+        if found or gone:
+            viewer.put(found, gone)
+        if viewer.known.is_growing and (found or self.watched.is_finished):
+            viewer.tell(_known(self.watched, self.data, self.mm_per_unit))
+
+    def _ready(self, here: Listening) -> None:
+        call = outcome()
+        self.result.update(url=here.url, port=here.port)
+        if not here.is_local:
+            warnings.warn(f"anyone on the network can see the images at {here.url}", stacklevel=2)
+        call.last(f"open {here.url}")
+        if here.is_local:
+            tunnel = f"ssh -L {here.port}:localhost:{here.port} HOST"
+            call.last(f"from another machine: {tunnel}, then open http://localhost:{here.port} there")
+        print("Ctrl-C ends it.", flush=True)
+
+    def _measured(self, call: Outcome, record: Mapping[str, Any], words: str) -> None:
+        """On a thread of the server, which does not know of which call it is."""
+        lengths = self.result["lengths"]
+        assert isinstance(lengths, list)
+        lengths.append(dict(record))
+        call.last(words)
+
+
+def _known(watched: WatchedRun, data: Path | None, mm_per_unit: float | None) -> Known:
+    """The unit of lengths, and the frames where they are found; none before there is a map."""
+    growing, folder = not watched.is_finished, watched.folder
+    unit = _unit_meant(watched, mm_per_unit) if growing else run_unit(folder, mm_per_unit)
+    if not map_folders(folder):
+        return Known(unit, Pictures(), is_growing=growing)
+    try:
+        frames, missing = run_frames(folder, data, watched.record)
+    except InputError as error:
+        if data is not None:
+            raise
+        frames, missing = None, f"the run's frames cannot be read: {error}"
+    if missing:
+        warnings.warn(f"{missing}: cameras have no pictures; give --data", stacklevel=2)
+    notes = ("The run's frames are not there: cameras have no pictures.",) if missing else ()
+    return Known(unit, Pictures(frames), notes, growing)
+
+
+def _unit_meant(watched: WatchedRun, mm_per_unit: float | None) -> str:
+    """As `run_unit`, of a run that is still at work."""
+    arguments = watched.record.get("arguments")
+    asked = isinstance(arguments, Mapping) and arguments.get("mm_per_unit") is not None
+    if asked and mm_per_unit is not None:
+        raise InputError(watched.folder, "its surfaces are in mm already", "leave --mm-per-unit out")
+    return "mm" if asked or mm_per_unit is not None else "map units"
