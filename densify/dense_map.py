@@ -347,11 +347,15 @@ def read_dense_map(folder: str | Path) -> DenseMapFiles:
 def _dense_map(folder: Path, map_id: int) -> DenseMapFiles:
     mesh, cloud = _read_ply(folder / "mesh.ply"), _read_ply(folder / "sparse.ply")
     triangles = np.asarray(getattr(mesh, "faces", np.zeros((0, 3))), int)
+    vertices = np.asarray(getattr(mesh, "vertices", np.zeros((0, 3))), float)  # an empty mesh is read as a scene
+    if not (np.isfinite(vertices).all() and ((triangles >= 0) & (triangles < len(vertices))).all()):
+        found = "a vertex is at no place, or a triangle has one that is not there"
+        raise InputError(folder / "mesh.ply", found, "copy it again from the run")
     numbers, poses = read_tum(folder / "trajectory.tum")
     own = vertex_columns(mesh, ("confidence", "views", "expected_error")) if len(triangles) else {}
     return DenseMapFiles(
         id=map_id,
-        vertices=np.asarray(getattr(mesh, "vertices", np.zeros((0, 3))), float),  # an empty mesh is read as a scene
+        vertices=vertices,
         triangles=triangles,
         sparse=np.asarray(cloud.vertices, float),
         sparse_inlier=(np.asarray(cloud.colors)[:, :3] == GREEN).all(1),

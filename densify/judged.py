@@ -3,6 +3,7 @@ first where it is asked to, and judges each against its truth."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -210,7 +211,8 @@ def read_asked(
     if truth is None:
         return Asked(run, source, config, trajectory, reading)
     if suite is None:
-        return Asked(run, source, config, trajectory, reading, pairs={truth.name: (run, truth)})
+        name = os.path.basename(os.path.abspath(truth))  # `.` has no name of its own
+        return Asked(run, source, config, trajectory, reading, pairs={name: (run, truth)})
     columns = read_suite(shipped(suite))
     pairs, missing = present(columns, run, truth)
     return Asked(run, source, config, trajectory, reading, columns, pairs, missing)

@@ -24,13 +24,20 @@ def run_frames(
     folder = map_folders(source)[0].parent
     beside = folder / "data" if (folder / "data").is_dir() else None  # where `demo` has them
     path = given or (Path(str(named["data"])) if named.get("data") else beside)
-    if path is None or not path.exists():
+    if path is None or not _is_there(path):
         return None, f"the run's frames are not found{f' ({path})' if path else ''}"
     own = {key: Path(str(named[key])) for key in ("camera", "mask") if named.get(key)}
     own = {key: file for key, file in own.items() if file.exists()}
     known = next((name for name in FORMATS if name == named.get("format")), None)
     camera = None if "camera" in own else read_camera(map_folders(source)[0] / "camera.json")
     return open_sequence(path, known, own.get("camera"), None, own.get("mask"), camera), ""
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that no file can have, or a folder that may not be looked into
+        return False
 
 
 def frame_of(frames: FrameSequence | None, number: int) -> Frame | None:

@@ -270,7 +270,9 @@ def test_the_share_of_wrong_points_can_be_given_either_way(tmp_path):
         assert known["0"]["spurious_point_ids"] == []
 
 
-def test_options_come_from_a_file_too_and_the_command_line_wins(data, tmp_path):
+def test_options_come_from_a_file_too_and_the_command_line_wins_and_the_surface_is_to_be_looked_at(
+    data, tmp_path, capsys
+):
     settings = {"checkpoint": "decline", "judge": {"on": False}, "alignment": {"t": 3.5}, "fusion": {"far": 1.5}}
     (tmp_path / "c.yaml").write_text(json.dumps(settings))
     argv = ["--config", tmp_path / "c.yaml", "--fusion.far", 1.25]
@@ -278,6 +280,7 @@ def test_options_come_from_a_file_too_and_the_command_line_wins(data, tmp_path):
     arguments = json.loads((tmp_path / "out" / "run.json").read_text())["arguments"]
     assert arguments["alignment"]["t"] == 3.5 and arguments["fusion"]["far"] == 1.25
     assert arguments["checkpoint"] == "decline"
+    assert f"next: lightdepth view {tmp_path / 'out'}\n" in capsys.readouterr().out
 
 
 WRONG_USAGE = {

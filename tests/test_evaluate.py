@@ -33,6 +33,7 @@ from densify.evaluation.tables import (
     trajectory_table,
 )
 from densify.evaluation.truth import read_truth
+from densify.judged import JudgingConfig, TruthSource, read_asked
 from densify.pipeline import densify
 from lightdepth.datasets import write_folder
 from lightdepth.errors import InputError
@@ -367,6 +368,12 @@ def test_truth_that_does_not_fit_is_refused_and_nothing_is_written(run, predicti
     found = judge_maps(models, read_truth(sequence(list(FRAMES[:7])), with_surface=False), common=True)
     assert [m.aligned.poses for m in found.judged.maps] == [5, 4]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_sequence_that_one_stands_in_is_called_by_its_folder(run, data, monkeypatch):
+    monkeypatch.chdir(data)
+    asked = read_asked(run, TruthSource(truth=Path(".")), JudgingConfig())
+    assert list(asked.pairs) == [data.name]
 
 
 def test_options_that_mean_nothing_are_refused(run, data, tmp_path):

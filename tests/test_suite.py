@@ -105,6 +105,8 @@ def test_runs_made_before_are_taken_as_they_are(trees, tmp_path):
         evaluate(tmp_path / "runs", data, tmp_path / "out", suite=SUITE)
     found = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert list(found["all"]) == ["sparse"]  # one sequence: its figures are the file's
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "<p>Not judged: t2a, " in page and ", Seq4; run.json has the reasons.</p>" in page
 
 
 def one_sequence(trees: tuple[Path, Path], folder: Path) -> Path:
@@ -160,6 +162,7 @@ def test_a_suite_that_contradicts_itself_is_refused(trees, tmp_path):
         "b (x) is there twice": {"groups": [{"title": "one", "sequences": {"a": "x", "b": "x"}}], "published": {}},
         "leads outside the data's root": {"groups": [{"title": "one", "sequences": {"a": "../x"}}], "published": {}},
         "fps": {"fps": 0},
+        "at most 100 characters": {"groups": [{"title": "one", "sequences": {"a" * 101: "x"}}], "published": {}},
     }
     for message, changes in cases.items():
         with refused(message):

@@ -24,7 +24,8 @@ from raising import refused
 from view_runs import AT, CANARY, LENGTH, RADIUS, dense_tube, tube, write_frames, write_run
 
 from densify.commands.measure import measure
-from lightdepth.errors import MachineFailure
+from densify.dense_map import DenseMap
+from lightdepth.errors import InputError, MachineFailure
 from lightdepth.files.lock import locked
 from lightdepth.files.replacing import unfinished_path
 from lightdepth.reporting.scene import Layer
@@ -329,7 +330,7 @@ def test_a_run_in_the_making_is_followed_from_before_its_first_map_to_its_end(tm
         os.rename(made, run)
         for _ in range(2):
             shown.made.follow(viewer)
-        assert viewer.maps["map_000"] is first and viewer.known.unit == "mm" and not viewer.known.is_growing
+        assert viewer.maps["map_000"] is first and viewer.known.unit == "mm" and viewer.known.state == "finished"
         assert shown.panel.picture.visible and "at work" not in shown.panel.note.content
         assert CANARY not in sent(shown.here)
 
@@ -427,3 +428,146 @@ def test_the_verb_says_where_to_look_and_how_from_elsewhere_and_ends_on_ctrl_c(r
         assert found["exit_code"] == 130 and found["next"].startswith("lightdepth measure RUN")
     else:
         assert out == ""
+
+
+def test_a_local_server_names_an_address_that_it_answers_at():
+    for host, told in (("127.1", "127.0.0.1"), ("localhost", "localhost"), ("127.0.0.2", "127.0.0.2")):
+        with local_server(host, 0) as here, urllib.request.urlopen(here.url) as page:
+            assert here.url == f"http://{told}:{here.port}" and here.is_local and page.status == 200
+
+
+def test_every_address_is_told_by_the_name_of_the_machine_and_answers_in_both_families():
+    for host in ("0", "0.0.0.0", "::"):
+        try:
+            with local_server(host, 0) as here:
+                assert here.host == socket.gethostname() and not here.is_local
+                with urllib.request.urlopen(f"http://127.0.0.1:{here.port}") as page:
+                    assert page.status == 200
+        except InputError:
+            assert host == "::" and not socket.has_ipv6  # a machine without it
+
+
+def test_a_request_that_names_two_hosts_or_two_origins_is_refused(shown):
+    for twice in ("Host: elsewhere.example", f"Origin: http://localhost:{shown.here.port}\r\nOrigin: http://elsewhere"):
+        with socket.create_connection(("127.0.0.1", shown.here.port), 10) as asked:
+            asked.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{shown.here.port}\r\n{twice}\r\n\r\n".encode())
+            assert asked.recv(100).startswith(b"HTTP/1.1 403 ")
+
+
+def test_a_run_that_another_took_the_place_of_has_the_unit_and_the_frames_of_the_other(tmp_path):
+    run = write_run(tmp_path / "run")
+    (run / "run.json").write_text('{"verb": "densify", "unit": "map units"}')
+    with viewing(run) as shown:
+        assert shown.viewer.known.unit == "map units" and not shown.panel.picture.visible
+        shutil.rmtree(run)
+        write_run(run, write_frames(tmp_path / CANARY))
+        for _ in range(2):
+            shown.made.follow(shown.viewer)
+        assert shown.viewer.known.unit == "mm" and shown.panel.picture.visible
+    run = write_run(tmp_path / "other")
+    (run / "run.json").write_text('{"verb": "densify", "unit": "map units"}')
+    with viewing(run, mm_per_unit=2.0) as shown, refused(found="in mm already"):
+        shutil.rmtree(run)
+        write_run(run)
+        for _ in range(2):
+            shown.made.follow(shown.viewer)
+
+
+def test_a_run_that_is_gone_or_was_stopped_is_said_to_be(tmp_path):
+    run = write_run(tmp_path / "run")
+    with viewing(run) as shown:
+        shutil.rmtree(run)
+        for _ in range(3):
+            shown.made.follow(shown.viewer)
+        assert shown.viewer.maps == {} and "no longer in its place" in shown.panel.note.content
+    made = unfinished_path(tmp_path / "stopped")
+    dense_tube().write(made / "map_000")
+    with viewing(tmp_path / "stopped") as shown:
+        assert "The run was stopped" in shown.panel.note.content and "at work" not in shown.panel.note.content
+
+
+def test_a_surface_that_became_empty_is_no_longer_drawn(tmp_path):
+    run = write_run(tmp_path / "run", maps=2)
+    with viewing(run) as shown:
+        shutil.rmtree(run / "map_000")
+        dense, none = dense_tube(), np.zeros((0, 3))
+        empty = DenseMap(dense.submap, none, none.astype(int), none, dense.alignments, 0.5, "mm")
+        empty.write(run / "map_000")
+        for _ in range(2):
+            shown.made.follow(shown.viewer)
+        assert list(shown.viewer.maps) == ["map_001"]
+
+
+def test_what_was_measured_stays_while_other_maps_come(tmp_path):
+    run = write_run(tmp_path / "run")
+    with viewing(run) as shown:
+        for at in (on_tube(0, 10), on_tube(0, 20)):
+            click(shown.viewer, (0, 0, 20), at)
+        dense_tube(1).write(run / "map_001")
+        for _ in range(2):
+            shown.made.follow(shown.viewer)
+        assert len(shown.viewer.maps) == 2 and "along the surface" in shown.panel.measured.content
+        assert len(shown.viewer._places) == 2
+
+
+def test_a_map_that_is_half_written_when_the_viewer_starts_is_shown_when_it_is_whole(tmp_path):
+    run = tmp_path / "run"
+    made = unfinished_path(run)
+    dense_tube().write(made / "map_000")
+    whole = (made / "map_000" / "mesh.ply").read_bytes()
+    (made / "map_000" / "mesh.ply").write_bytes(whole[:5000])
+    with viewing(run) as shown:
+        assert shown.viewer.maps == {}
+        (made / "map_000" / "mesh.ply").write_bytes(whole)
+        for _ in range(2):
+            shown.made.follow(shown.viewer)
+        assert list(shown.viewer.maps) == ["map_000"]
+
+
+def test_a_map_that_goes_while_a_picture_is_read_leaves_the_others_theirs(shown, monkeypatch):
+    viewer, pictures = shown.viewer, shown.viewer.known.pictures
+    wait_until(lambda: all(c.image is not None for drawn in viewer.maps.values() for c in drawn.cameras.values()))
+    read, asked = pictures.small, []
+
+    def small(number: int):
+        if not asked:
+            asked.append(number)
+            viewer.put([], ["map_000"])
+        return read(number)
+
+    monkeypatch.setattr(pictures, "small", small)
+    again = [viewer.maps[name].viewed for name in ("map_000", "map_001")]
+    viewer.put(again)
+    wait_until(lambda: asked and "map_000" not in viewer.maps)
+    wait_until(lambda: all(camera.image is not None for camera in viewer.maps["map_001"].cameras.values()))
+    assert viewer._filling.is_alive()
+
+
+def test_a_map_folder_is_shown_from_within_it(run, monkeypatch):
+    monkeypatch.chdir(run / "map_001")
+    assert [viewed.name for viewed in WatchedRun(Path(".")).first()] == ["map_001"]
+
+
+@pytest.mark.parametrize("spoil", ["vertex", "triangle"])
+def test_a_surface_whose_numbers_cannot_be_is_refused(tmp_path, spoil):
+    run, dense = tmp_path / "run", dense_tube()
+    vertices, triangles = dense.vertices.copy(), dense.triangles.copy()
+    if spoil == "vertex":
+        vertices[5, 1] = np.nan
+    else:
+        triangles[7, 1] = len(vertices)
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}", *(f"property float {a}" for a in "xyz")]
+    lines += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header"]
+    lines += [" ".join(map(str, vertex)) for vertex in vertices]
+    lines += [" ".join(map(str, (3, *triangle))) for triangle in triangles]
+    write_run(run)
+    (run / "map_000" / "mesh.ply").write_text("\n".join(lines) + "\n")
+    with refused(where="mesh.ply", cure="copy it again"):
+        WatchedRun(run).first()
+
+
+def test_a_run_whose_frames_have_a_name_that_cannot_be_is_shown_without_them(tmp_path):
+    run = write_run(tmp_path / "run")
+    (run / "run.json").write_text(json.dumps({"verb": "densify", "arguments": {"data": "a/" * 3000}}))
+    with pytest.warns(UserWarning, match="frames are not found"):
+        assert Viewing.of(run, None, None, 50_000).known.notes

@@ -81,5 +81,4 @@ def densify(
             joined_section(page, work.merged)
         page.files(run.folder, FILES)
         page.write(run.folder / "report.html")
-    then = f"lightdepth measure {quote(str(output))} --frame NUMBER --pixels '[[U, V], [U, V]]'"
-    end(output, then=then, page=output / "report.html")
+    end(output, then=f"lightdepth view {quote(str(output))}", page=output / "report.html")

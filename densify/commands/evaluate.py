@@ -72,6 +72,7 @@ def evaluate(
         sources = Sources(run, source.truth, gap, "" if first is None else str(first))
         judged = (answer.found, out.folder, answer.withheld, sources, asked.suite)
         write_evaluations(*judged)
-        evaluation_page(*judged).write(out.folder / "report.html")
+        failed = [failure["what"] for failure in out.record["failures"]]
+        evaluation_page(*judged, failed).write(out.folder / "report.html")
         out.log(in_short(answer.found, answer.withheld, sources))
     end(folder, then=f"cat {quote(str(folder / 'metrics.md'))}", page=folder / "report.html")

@@ -46,9 +46,13 @@ def evaluation_page(
     withheld: Sequence[WithheldOfMap] = (),
     sources: Sources | None = None,
     suite: Suite | None = None,
+    failed: Sequence[str] = (),
 ) -> Report:
-    """The page of an evaluation whose files write_evaluations has put into `folder`."""
+    """The page of an evaluation whose files write_evaluations has put into `folder`; `failed` names what could not be
+    judged."""
     report = Report("Errors against truth")
+    if failed:
+        report.text(f"Not judged: {', '.join(failed)}; run.json has the reasons.")
     for line in not_judged(found):
         report.text(line)
     short = short_tables(found, withheld)

@@ -27,7 +27,9 @@ _Row = list[float | None]
 class _Group(BaseModel):
     model_config = ConfigDict(extra="forbid")
     title: str
-    sequences: Annotated[dict[Annotated[str, Field(pattern=r"^[\w-]+$")], SequenceName], Field(min_length=1)]
+    sequences: Annotated[
+        dict[Annotated[str, Field(pattern=r"^[\w-]+$", max_length=100)], SequenceName], Field(min_length=1)
+    ]
     surface: bool = True
 
 

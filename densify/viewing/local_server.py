@@ -36,14 +36,14 @@ class Listening:
 
     server: viser.ViserServer
     host: str
+    """by which a browser asks for it: a local server goes by its address, or by localhost"""
     port: int
     is_local: bool
     """whether only programs of this machine can ask it"""
 
     @property
     def url(self) -> str:
-        host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(self.host, self.host)
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
+        return f"http://{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
 
 
 @contextmanager
@@ -54,7 +54,7 @@ def local_server(host: str, port: int) -> Iterator[Listening]:
         address = ipaddress.ip_address(place.getsockname()[0])
         server = _started(place, address.is_loopback)
         try:
-            yield Listening(server, host, place.getsockname()[1], address.is_loopback)
+            yield Listening(server, _asked_by(host, address), place.getsockname()[1], address.is_loopback)
         finally:
             with redirect_stdout(io.StringIO()):
                 server.stop()
@@ -62,8 +62,9 @@ def local_server(host: str, port: int) -> Iterator[Listening]:
 
 def _listening(host: str, port: int) -> socket.socket:
     try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        return socket.create_server((host, port), family=family)
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        both = address[0] == "::" and socket.has_dualstack_ipv6()
+        return socket.create_server((host, port), family=family, dualstack_ipv6=both)
     except (socket.gaierror, UnicodeError) as error:
         raise InputError("--host", f"{host!r} is no host", _OURS) from error
     except OSError as error:
@@ -73,6 +74,12 @@ def _listening(host: str, port: int) -> socket.socket:
         if error.errno == errno.EACCES:
             raise InputError("--port", f"{port} is not for everyone", "give one of 1024 or more") from error
         raise InputError("--host", f"nothing can listen there ({os.strerror(error.errno or 0)})", _OURS) from error
+
+
+def _asked_by(host: str, address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:
+    if address.is_unspecified:
+        return socket.gethostname()
+    return str(address) if address.is_loopback and host not in _LOCAL else host
 
 
 class _Unshared(viser.ViserServer):
@@ -109,7 +116,10 @@ def _started(place: socket.socket, is_local: bool) -> viser.ViserServer:
 def is_welcome(headers: Headers, is_local: bool) -> bool:
     """Whether a request comes from the server's own page, or from no page. Of a server that listens to this machine
     alone, the page must have been asked for by a local name: another one may lead here by a trick of its owner's."""
-    host, origin = headers.get("Host", ""), headers.get("Origin")
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+    if len(hosts) > 1 or len(origins) > 1:
+        return False
+    host, origin = "".join(hosts), origins[0] if origins else None
     name = host.rpartition(":")[0] if not host.endswith("]") and ":" in host else host
     if is_local and name not in _LOCAL and not _is_loopback(name):
         return False

@@ -18,7 +18,7 @@ from densify.viewing.drawn import CHOSEN, DrawnMap, extent
 from densify.viewing.panel import Panel, lines, put_value
 from densify.viewing.pictures import Pictures
 from densify.viewing.ruler import Place, Ruler
-from densify.viewing.watched import ViewedMap
+from densify.viewing.watched import State, ViewedMap
 from lightdepth.counting import counted
 from lightdepth.errors import InputError
 from lightdepth.reporting.scene import Surface
@@ -27,17 +27,30 @@ _FOV = 2 * float(np.arctan(0.36))  # of a look from outside, up and down
 _AROUND = 1.08  # of what is looked at from outside, with a little room
 _WIDEST = 2.0  # radians, of a look from inside
 _WAY = (214, 40, 120)
+_SAID: dict[State, tuple[str, str]] = {
+    "finished": ("", "The run has no surface now."),
+    "at work": (
+        "The run is at work: maps come as it finishes them.",
+        "No surface yet: it comes when the run has finished its first map.",
+    ),
+    "stopped": (
+        "The run was stopped: no more maps come unless it is resumed.",
+        "The run was stopped before its first surface.",
+    ),
+    "gone": ("The run is no longer in its place.",) * 2,
+}
+"""What is said of a run's state: where there is a map, and where there is none."""
 
 
 @dataclass(frozen=True)
 class Known:
     """What is known of a run beside its maps: the unit of lengths, the pictures of its keyframes, what is to be said of
-    both, and whether more maps may come."""
+    both, and how it stands with the run."""
 
     unit: str
     pictures: Pictures
     notes: tuple[str, ...] = ()
-    is_growing: bool = False
+    state: State = "finished"
 
 
 class Viewer:
@@ -108,7 +121,8 @@ class Viewer:
                 for name in self.maps:
                     put_value(self.on[name], name == self._best())
                 self._look_first()
-            self._clear()
+            if any(place.map in {*gone, *(viewed.name for viewed in maps)} for place in self._places):
+                self._clear()
             self._note()
             self._show()
         self._more.set()
@@ -197,9 +211,10 @@ class Viewer:
 
     def _enter(self, client: viser.ClientHandle) -> None:
         """Looks from where a keyframe was taken."""
-        now = self._station_now()
-        assert now is not None
-        drawn = self.maps[now[0]]
+        with self._lock:
+            if (now := self._station_now()) is None:
+                return
+            drawn = self.maps[now[0]]
         surface, center = drawn.viewed.surface, drawn.centers[now[1]]
         _, down, ahead = surface.poses[now[1]].cam_from_map[:3, :3]
         tangent = max(surface.tangents[1], surface.tangents[0] / max(client.camera.aspect, 0.1))
@@ -256,13 +271,19 @@ class Viewer:
                 waiting = [drawn for name, drawn in self.maps.items() if done.get(name) != (drawn, pictures)]
             for drawn in waiting:
                 for row, camera in drawn.cameras.items():
-                    if self._over or self.known.pictures is not pictures or drawn not in self.maps.values():
+                    if not self._is_wanted(drawn, pictures):
                         break
                     picture = pictures.small(int(drawn.viewed.read.numbers[row]))
-                    if picture is not None:
-                        camera.image = picture
+                    with self._lock:  # a camera that was removed takes no picture
+                        if not self._is_wanted(drawn, pictures):
+                            break
+                        if picture is not None:
+                            camera.image = picture
                 else:
                     done[drawn.viewed.name] = (drawn, pictures)
+
+    def _is_wanted(self, drawn: DrawnMap, pictures: Pictures) -> bool:
+        return not self._over and self.known.pictures is pictures and drawn in self.maps.values()
 
     # The ruler
 
@@ -335,11 +356,7 @@ class Viewer:
 
     def _note(self) -> None:
         """What is to be said of the run as a whole."""
-        said = []
-        if not self.maps:
-            said.append("No surface yet: it comes when the run has finished its first map.")
-        elif self.known.is_growing:
-            said.append("The run is at work: maps come as it finishes them.")
+        said = [_SAID[self.known.state][not self.maps]]
         fewer = [d.viewed.surface for d in self.maps.values() if d.viewed.surface.made is not None]
         if any(len(s.triangles) < (s.made or 0) for s in fewer):
             drawn, made = sum(len(s.triangles) for s in fewer), sum(s.made or 0 for s in fewer)

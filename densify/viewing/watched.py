@@ -10,6 +10,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from densify.dense_map import DenseMapFiles, map_folders, read_dense_map, read_keyframes, run_record, surface_folders
 from densify.evaluation.pictures import read_error
@@ -25,6 +26,9 @@ VERBS = ("densify", "live", "demo")
 _FILES = ("mesh.ply", "sparse.ply", "trajectory.tum", "camera.json")
 _MORE = ("keyframes.csv",)
 _EXPECTED = "expected a run of `lightdepth densify`, `live` or `demo`"
+
+State = Literal["finished", "at work", "stopped", "gone"]
+"""How it stands with a run: in its place, in the making, in the making but nobody works at it, or nowhere."""
 
 Stamp = tuple[tuple[int, int], ...]
 """Time of change [ns] and size of each file; zeros where there is none."""
@@ -44,6 +48,7 @@ class WatchedRun:
     InputError where the folder is no run that has surfaces, or will have."""
 
     def __init__(self, run: Path, most: int = TRIANGLES) -> None:
+        run = run if run.name not in ("", "..") else Path(os.path.abspath(run))  # `.` does not say which map it is
         self._run, self._made, self._most = run, unfinished_path(Path(os.path.abspath(run))), most
         self._last: dict[str, Stamp] = {}
         self._shown: dict[str, Stamp] = {}
@@ -53,6 +58,15 @@ class WatchedRun:
     def is_finished(self) -> bool:
         """Whether the run is in its place."""
         return self._run.is_dir() or not self._made.is_dir()
+
+    @property
+    def state(self) -> State:
+        """How it stands with the run now."""
+        if self._run.is_dir():
+            return "finished"
+        if not self._made.is_dir():
+            return "gone"
+        return "at work" if is_live(Path(os.path.abspath(self._run))) else "stopped"
 
     @property
     def folder(self) -> Path:
@@ -65,23 +79,28 @@ class WatchedRun:
         return run_record(self._run) if self.is_finished else begun_with(self._made) or {}
 
     def first(self) -> list[ViewedMap]:
-        """The maps that there are. Raises InputError where one cannot be read, or where a finished run has none with a
-        surface."""
-        stamps = self._stamps()
-        whole = [f.name for f in surface_folders(self._run)] if self.is_finished else [*stamps]
-        found = [self._read(name) for name in whole]
+        """The maps that there are. Raises InputError where one of a finished run cannot be read, or where it has none
+        with a surface; one of a run in the making may be half written, and is left to the next poll."""
+        stamps, found = self._stamps(), []
         self._last, self._shown = stamps, dict(stamps)
+        for name in [f.name for f in surface_folders(self._run)] if self.is_finished else [*stamps]:
+            try:
+                found.append(self._read(name))
+            except (InputError, OSError):
+                if self.is_finished:
+                    raise
+                del self._shown[name]
         with_surface = [each for each in found if len(each.surface.triangles)]
         if self.is_finished and not with_surface:
             raise InputError(self._run, "all its surfaces are empty", "keyframes.csv of each map has the reasons")
         return with_surface
 
     def changed(self) -> tuple[list[ViewedMap], list[str]]:
-        """The maps whose files are others than when this was asked before, and the names of those that are gone. One
-        that cannot be read now is read at the next poll."""
+        """The maps whose files are others than when this was asked before, and the names of those that are gone or have
+        no surface any more. One that cannot be read now is read at the next poll."""
         stamps = self._stamps()
         steady = {name for name, stamp in stamps.items() if self._last.get(name) == stamp}
-        found = []
+        found, empty = [], []
         for name in steady:
             if self._shown.get(name) == stamps[name]:
                 continue
@@ -92,11 +111,13 @@ class WatchedRun:
             self._shown[name] = stamps[name]
             if len(read.surface.triangles):
                 found.append(read)
+            else:
+                empty.append(name)
         gone = [name for name in self._shown if name not in stamps and name not in self._last]
         for name in gone:
             del self._shown[name]
         self._last = stamps
-        return found, gone
+        return found, gone + empty
 
     def _read(self, name: str) -> ViewedMap:
         folder = self.folder if self.folder.name == name else self.folder / name

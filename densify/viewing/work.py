@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -63,12 +63,18 @@ class Viewing:
                 viewer.close()
 
     def follow(self, viewer: Viewer) -> None:
-        """Brings a viewer to what the run's files are now."""
+        """Brings a viewer to what the run's files are now. A run that took the place of the one that was shown may have
+        another unit and other frames. Raises InputError where it cannot be shown as it was asked for."""
         found, gone = self.watched.changed()
+        known, state = viewer.known, self.watched.state
+        if state == "gone":
+            known = replace(known, state=state)
+        elif found or gone or state != known.state:
+            known = _known(self.watched, self.data, self.mm_per_unit)
         if found or gone:
             viewer.put(found, gone)
-        if viewer.known.is_growing and (found or self.watched.is_finished):
-            viewer.tell(_known(self.watched, self.data, self.mm_per_unit))
+        if known != viewer.known:
+            viewer.tell(known)
 
     def _ready(self, here: Listening) -> None:
         call = outcome()
@@ -77,7 +83,8 @@ class Viewing:
             warnings.warn(f"anyone on the network can see the images at {here.url}", stacklevel=2)
         call.last(f"open {here.url}")
         if here.is_local:
-            tunnel = f"ssh -L {here.port}:localhost:{here.port} HOST"
+            there = here.host if here.host.startswith("127.") and here.host != "127.0.0.1" else "localhost"
+            tunnel = f"ssh -L {here.port}:{there}:{here.port} HOST"
             call.last(f"from another machine: {tunnel}, then open http://localhost:{here.port} there")
         print("Ctrl-C ends it.", flush=True)
 
@@ -91,10 +98,10 @@ class Viewing:
 
 def _known(watched: WatchedRun, data: Path | None, mm_per_unit: float | None) -> Known:
     """The unit of lengths, and the frames where they are found; none before there is a map."""
-    growing, folder = not watched.is_finished, watched.folder
-    unit = _unit_meant(watched, mm_per_unit) if growing else run_unit(folder, mm_per_unit)
+    state, folder = watched.state, watched.folder
+    unit = run_unit(folder, mm_per_unit) if state == "finished" else _unit_meant(watched, mm_per_unit)
     if not map_folders(folder):
-        return Known(unit, Pictures(), is_growing=growing)
+        return Known(unit, Pictures(), state=state)
     try:
         frames, missing = run_frames(folder, data, watched.record)
     except InputError as error:
@@ -104,7 +111,7 @@ def _known(watched: WatchedRun, data: Path | None, mm_per_unit: float | None) ->
     if missing:
         warnings.warn(f"{missing}: cameras have no pictures; give --data", stacklevel=2)
     notes = ("The run's frames are not there: cameras have no pictures.",) if missing else ()
-    return Known(unit, Pictures(frames), notes, growing)
+    return Known(unit, Pictures(frames), notes, state)
 
 
 def _unit_meant(watched: WatchedRun, mm_per_unit: float | None) -> str:
