@@ -49,14 +49,14 @@ def view_to_fuse(
 ) -> SurfaceView:
     """A keyframe's depth in map units, rectified, as far as the fusion reaches and where it is expected to be right.
     `stays` (h, w), coarse, is the share of its weight that a pixel keeps; None is all of it."""
-    taken = sure(alignment.applied(prediction), alignment.range_90, config.fusion)
+    taken = sure(alignment.applied(prediction), alignment.range_90, image, config.fusion)
     return _rectified(alignment, taken, image, config, stays)
 
 
-def sure(applied: DepthPrediction, reach: float, config: FusionConfig) -> DepthPrediction:
+def sure(applied: DepthPrediction, reach: float, image: np.ndarray, config: FusionConfig) -> DepthPrediction:
     """A prediction in map units, less the pixels that are expected to err by more than the fusion takes; `reach` is the
     distance within which 90 % of the keyframe's inliers lie."""
-    error = expected_share(applied, reach)
+    error = expected_share(applied, reach, image)
     return replace(applied, valid=applied.valid & (100 * error <= config.max_error))
 
 
@@ -83,7 +83,7 @@ class FullFuser:
         assert seen.frame is not None and seen.prediction is not None
         prediction, image, name = seen.prediction, seen.frame.image, aligned.keyframe.name
         applied = aligned.alignment.applied(prediction)
-        taken = sure(applied, aligned.alignment.range_90, self._config.fusion)
+        taken = sure(applied, aligned.alignment.range_90, image, self._config.fusion)
         view = _rectified(aligned.alignment, taken, image, self._config, aligned.stays)
         self._volume.integrate(view, aligned.keyframe.cam_from_map)
         self._given[name] = Given.of(view, prediction)

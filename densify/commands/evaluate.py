@@ -70,9 +70,9 @@ def evaluate(
         out.hash_inputs(truth=source.truth)
         answer = judge_asked(asked, first, out)
         sources = Sources(run, source.truth, gap, "" if first is None else str(first))
-        judged = (answer.found, out.folder, answer.withheld, sources, asked.suite)
-        write_evaluations(*judged)
+        write_evaluations(answer.found, out.folder, answer.withheld, sources, asked.suite)
         failed = [failure["what"] for failure in out.record["failures"]]
-        evaluation_page(*judged, failed).write(out.folder / "report.html")
+        page = evaluation_page(answer.found, out.folder, answer.withheld, sources, asked.suite, failed)
+        page.write(out.folder / "report.html")
         out.log(in_short(answer.found, answer.withheld, sources))
     end(folder, then=f"cat {quote(str(folder / 'metrics.md'))}", page=folder / "report.html")

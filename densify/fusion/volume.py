@@ -55,10 +55,10 @@ class FusionConfig:
     """Farthest distance from a keyframe that is fused, as a multiple of the distance within which 90 % of its inliers
     lie. A larger one reaches farther, where depth is worse."""
 
-    max_error: Annotated[float, above(0)] = 9.0
+    max_error: Annotated[float, above(0)] = 12.0
     """Largest error, a ratio to the distance in per cent, that is expected of a pixel that is fused: by its
-    uncertainty, its slant, and how far it lies beyond the map's points. A larger one keeps more of the wall, less
-    accurately; the recipe paper keeps all."""
+    uncertainty, its slant, how far it lies beyond the map's points, and its light. A larger one keeps more of the wall,
+    less accurately; the recipe paper keeps all."""
 
     def voxel_for(self, submap: Submap) -> float:
         """The size of a voxel, in map units."""

@@ -145,7 +145,7 @@ def fused(task: Task, completed: Completed) -> np.ndarray:
         frame, prediction = task.seen[k.keyframe.name].frame, completed.get(k.keyframe.name)
         if prediction is not None and frame is not None:
             reach = k.alignment.range_90
-            taken = sure(prediction, reach, fusion)
+            taken = sure(prediction, reach, frame.image, fusion)
             view = surface_view(taken, frame.image, task.config.rectify, fusion.far * reach)
             volume.integrate(view, k.keyframe.cam_from_map)
     return volume.extract_mesh().vertices
