@@ -118,6 +118,8 @@ def test_withheld_points_are_in_every_report_with_a_constant_distance_beside(jud
     assert "| map 0 | constant distance | 40 | 0.3 | ∞ | 0.1 |" in text
     evaluate(run, None, tmp_path / "without")
     assert "| map 0 | this depth | 40 |" in (tmp_path / "without" / "metrics.md").read_text()
+    assert "<h1>Agreement with the sparse map</h1>" in (tmp_path / "without" / "report.html").read_text()
+    assert "<h1>Errors against truth</h1>" in (judged / "report.html").read_text()
 
 
 def test_tables_are_laid_out_as_the_paper_s(judged):

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from densify.evaluation.pictures import MODELS
 from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged, Sources, SurfaceFigures
-from densify.evaluation.tables import Cell, Table, depth_table, gap_note, withheld_table
+from densify.evaluation.tables import Cell, Table, depth_table, source_notes, withheld_table
 from densify.judging.withheld import WithheldOfMap
 
 
@@ -21,10 +21,7 @@ def in_short(
     sources: Sources | None = None,
 ) -> str:
     """The text of a few tables, and what could not be judged."""
-    notes = not_judged(found)
-    if sources is not None:
-        notes += [] if sources.gap is None else [gap_note(sources.gap)]
-        notes += [f"{sources.made}.\n"] if sources.made else []
+    notes = [*not_judged(found), *source_notes(sources)]
     return "\n".join([*(t.markdown() for t in short_tables(found, withheld)), *notes]).rstrip()
 
 

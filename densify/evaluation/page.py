@@ -18,7 +18,7 @@ FILES = {
     "metrics.tex": "the same as a paper has them",
     "metrics.csv": "every figure, one a line",
     "metrics.json": "every figure, for programs",
-    f"*{CURVES}.csv": "share of the surface within each error",
+    f"*{CURVES}.csv": "share of model points, or of pixels, within each error",
     "*_error.ply": "the surface, coloured by its error",
 }
 
@@ -50,7 +50,7 @@ def evaluation_page(
 ) -> Report:
     """The page of an evaluation whose files write_evaluations has put into `folder`; `failed` names what could not be
     judged."""
-    report = Report("Errors against truth")
+    report = Report("Errors against truth" if found else "Agreement with the sparse map")
     if failed:
         report.text(f"Not judged: {', '.join(failed)}; run.json has the reasons.")
     for line in not_judged(found):
@@ -61,7 +61,8 @@ def evaluation_page(
         prefix, of = prefix_of(name, found), f"{name}: " if len(found) > 1 else ""
         pictures = []
         if evaluation.curves:
-            caption = f"{of}share of the surface within each error"
+            share = "pixels" if isinstance(evaluation.judged, DepthJudged) else "model points"
+            caption = f"{of}share of {share} within each error"
             pictures.append(((folder / f"{prefix}{CURVES}.png").read_bytes(), caption))
         for mesh in evaluation.meshes:
             caption = f"{of}{mesh.name}, coloured by its distance to the true surface"

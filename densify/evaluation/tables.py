@@ -310,10 +310,15 @@ def notes_of(found: Mapping[str, Evaluation[DepthJudged | MapsJudged]], sources:
             notes.append(f"Alignment: {judged.alignment}. CLiMB: {judged.trajectory.climb_rule}.\n")
             if judged.trajectory.localised_share is None:
                 notes.append(f"Share of frames localised {judged.trajectory.localised_of}.\n")
-    if sources is not None:
-        notes += [] if sources.gap is None else [gap_note(sources.gap)]
-        notes += [f"{sources.made}.\n"] if sources.made else []
-    return notes
+    return [*notes, *source_notes(sources)]
+
+
+def source_notes(sources: Sources | None) -> list[str]:
+    """The gap between two submaps, and how maps were made dense for the evaluation."""
+    if sources is None:
+        return []
+    gap = [] if sources.gap is None else [gap_note(sources.gap)]
+    return [*gap, f"{sources.made}.\n"] if sources.made else gap
 
 
 def gap_note(gap: MapGap) -> str:
