@@ -26,6 +26,8 @@ if hasattr(os, "sched_setaffinity"):  # Open3D counts cores, and writes the same
 from killing import Case, Stage, Verb, drawn, run  # noqa: E402 - the threads of libraries come first
 
 ON_MAP = ("--map", "synth/slam", "--checkpoint", "decline")
+TWO_MAPS = ("--recipes", "[paper]", "--wrong-shares", "[0.1, 0.3]", "--cases", "[]")
+"""Of each scene of a bench: the fewest of which some can be finished and others not."""
 VERBS = (
     Verb(
         "synth",
@@ -80,7 +82,7 @@ VERBS = (
     Verb("evaluate", ("evaluate", "predict", "--truth", "synth", "-o", "out"), "out", ("--max-depth-mm", "20")),
     Verb(
         "bench",
-        ("bench", "-o", "out", "--checkpoints", "[decline]", "--image-size", "[64, 48]"),
+        ("bench", "-o", "out", "--checkpoints", "[decline]", "--image-size", "[64, 48]", *TWO_MAPS),
         "out",
         ("--first-seed", "7"),
         resumes=True,
