@@ -42,6 +42,7 @@ from lightdepth.reporting.run import input_hash
 from lightdepth.signals import finishing_first
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
+from .board import hyper_parameters, opening
 from .callbacks import validation_line
 from .card import Card, Doubt
 from .checkpoints import BEST, LAST, Start, clear_cut_off, newest
@@ -174,9 +175,12 @@ def _fitted(
     data.tell = partial(_warned, echo)
     checkpoints = folder / "checkpoints"
     with finishing_first() as received:
-        options = _with_callbacks(trainer_options, folder, echo, data, job.settings, received, start)
+        board = hyper_parameters(model, data, trainer_options, job.seed)
+        options = _with_callbacks(trainer_options, folder, echo, data, job.settings, received, start, board)
         with _refusals_named(MisconfigurationException, ValueError, TypeError, RuntimeError):  # the last: of a cluster
             trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the parser checked them against Trainer
+        if shows := opening(trainer.logger, folder):
+            echo(shows)
         if job.resume:
             echo(start.said if start else "nothing to resume: starting anew")
         if start is not None:
@@ -197,6 +201,8 @@ def _fitted(
         final = f"train loss {float(train_loss):.4g}  " if train_loss is not None else ""
         echo(f"final: {final}{validation_line(found)}")
         record = _exported(model, data, folder, chosen, errors, job, echo)
+        if shows:
+            echo(opening(trainer.logger, output))
         sync_below(folder)  # run.json says that the rest is whole
         record["resumed"] = start is not None
         write_run_json(folder, "train", {"argv": names.command(job.arguments)}, started, record, names)
