@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from densify.config import LiveConfig
@@ -78,4 +79,4 @@ def live(
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:
             played = play(frames, sparse_map, model, config, result.add, rate, lambda _: bar.advance())
         result.finish(played, model.name, rate, budget_ms)
-    end(output, then="lightdepth densify DATA --map MAP -o runs/dense", page=output / "report.html")
+    end(output, then=f"lightdepth view {quote(str(output))}", page=output / "report.html")
