@@ -211,7 +211,7 @@ def _eight_bits(image: Tensor) -> np.ndarray:
 
 
 def _coloured(log_distance: Tensor, mask: np.ndarray) -> np.ndarray:
-    """(1, H, W) centred log distance in colours, yellow near, from half to thrice the median; black outside."""
+    """(1, H, W) centred log distance in colours, light near, from half to thrice the median; black outside."""
     from matplotlib import colormaps
 
     level = ((_flat(log_distance.float()) + math.log(2)) / math.log(6)).clip(0, 1)

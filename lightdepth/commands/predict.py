@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -72,7 +73,7 @@ def predict(
         run.hash_inputs(**source.files, checkpoint=Path(predicting.checkpoint), uncertainty=uncertainty)
         frames = open_frames(source, run).without_truth()
         what = f"{counted(len(frames), 'frame')} of {frames.source} would be predicted by {model.name}"
-        run.begins(what, lambda: _steps(frames, model))
+        run.begins(what, lambda: _steps(frames, model, previews))
         if previews:
             (run.folder / "previews").mkdir(exist_ok=True)
         nothing, meter, gate = 0, ColourMeter(), DepthGate()
@@ -121,8 +122,14 @@ def predict(
     end(output, then=f"lightdepth export {quote(str(output))} -o runs/png --to png")
 
 
-def _steps(frames: FrameSequence, model: DepthModel) -> list[Step]:
-    return [Step(f"predicting {counted(len(frames), 'frame')}", times(len(frames), seconds_each(frames, model)))]
+def _steps(frames: FrameSequence, model: DepthModel, previews: bool) -> list[Step]:
+    def made(frame: Frame) -> None:
+        prediction = model(frame)
+        prediction.save(BytesIO())
+        if previews:
+            _preview(frame, prediction)
+
+    return [Step(f"predicting {counted(len(frames), 'frame')}", times(len(frames), seconds_each(frames, made)))]
 
 
 def _written(folder: Path, frame: Frame, prediction: DepthPrediction, previews: bool) -> list[Path]:
@@ -131,9 +138,14 @@ def _written(folder: Path, frame: Frame, prediction: DepthPrediction, previews: 
     prediction.save(file)
     if not previews:
         return [file]
-    colors = colored_distance(prediction.distance, prediction.valid)
-    preview.write_bytes(png(side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)])))
+    preview.write_bytes(_preview(frame, prediction))
     return [file, preview]
+
+
+def _preview(frame: Frame, prediction: DepthPrediction) -> bytes:
+    """The image beside its distance (PNG)."""
+    colors = colored_distance(prediction.distance, prediction.valid)
+    return png(side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)]))
 
 
 def _names(model: DepthModel, checkpoint: str) -> tuple[str, ...]:
