@@ -12,6 +12,8 @@ from densify.config import MethodConfig
 from densify.placing import Placing
 from lightdepth.calibration import write_camera
 from lightdepth.camera import CameraModel, Provenance
+from lightdepth.command_line.dry import Step
+from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.coloured import colours_of
 from lightdepth.datasets.pairing import check_shared_frames
@@ -125,6 +127,8 @@ def _say_localised(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> No
 
 def repaired(run: Run, sparse_map: SparseMap, frames: FrameSequence, config: SfmConfig) -> SparseMap:
     """The map made anew from the images of its keyframes, submap by submap, written to sparse/ in the run folder."""
+    keyframes = counted(sum(len(s.keyframes) for s in sparse_map.submaps), "keyframe")
+    run.begins(f"the map of {keyframes} would be made anew first", lambda: [Step(f"matching {keyframes}")])
     submaps, told = [], []
     for submap in sparse_map.submaps:
         seen = [k for k in submap.keyframes if k.number in frames.numbers]

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from lightdepth import __version__
-from lightdepth.command_line.outcome import manners, outcome, speaking
+from lightdepth.command_line.dry import DRY, Planned
+from lightdepth.command_line.outcome import manners, outcome, planned, speaking
 from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.command_line.pipes import fill_closed_streams, outliving_readers
 from lightdepth.command_line.verbs import all_verbs, summary_of, verb_parser
@@ -102,6 +103,9 @@ def _main(argv: list[str]) -> int:
         return 5 if _is_lost(verb) else _told(verb, error, 3)
     except PartialFailure as error:
         return _told(verb, error, 4)
+    except Planned as plan:
+        planned(plan)
+        return 0
     except AlreadyFinished as error:
         outcome().finished_before = True
         outcome().last(f"lightdepth {verb}: {error}")
@@ -175,6 +179,7 @@ def parse(function: Any, verb: str, argv: list[str]) -> dict[str, Any]:
     found = parsed(parser, without_gone(verb, with_real_settings(given)))
     if found.get("overwrite") and found.get("output"):
         check_apart(Path(found["output"]), config_files(given))
+    DRY.set(bool(found.pop("dry_run", False)))
     if "keep_names" not in inspect.signature(function).parameters:
         KEPT.set(bool(found.pop("keep_names", False)))
     return with_groups(function, parser.instantiate(found))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class DepthPrediction(Brief):
         """The prediction with its distance multiplied by `scale`."""
         return replace(self, distance=self.distance * np.float32(scale))
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path | BinaryIO) -> None:
         """One compressed .npz, with unit, camera and provenance in `meta`."""
         camera = {
             "model": self.camera.name,

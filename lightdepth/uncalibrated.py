@@ -17,6 +17,8 @@ import numpy as np
 from lightdepth.calibration import write_camera
 from lightdepth.calibration.json_files import camera_from_fields, fields_of
 from lightdepth.camera import CameraModel, Provenance
+from lightdepth.command_line.dry import Step
+from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.reading import size_of_frames
@@ -67,7 +69,7 @@ def with_camera(source: SequenceSource, run: Run, config: SfmConfig | None = Non
     """The source with its camera in the run's camera.json, found first where it asks for that."""
     if not source.asks_for_camera:
         return source
-    if run.done(_PART):
+    if run.plan is None and run.done(_PART):
         known = run.kept_of(_PART)
         run.record |= known["told"]
         camera = camera_from_fields(known["camera"], "the camera that was found")
@@ -88,6 +90,7 @@ def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = No
         stand_in = folder / "camera.json"
         write_camera(across(width, height, source.fov or 70.0), stand_in)
         frames = replace(source, camera=stand_in, fov=None).open().without_truth()
+        run.begins(f"{counted(len(frames), 'frame')}, {width}x{height}, whose camera is found first", _search)
         try:
             found = _found(frames, source.fov, run, config)
         except InputError as error:
@@ -106,6 +109,10 @@ def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = No
         return _assumed(run, (width, height), source.fov, why)
     (run.log if found.told else run.warn)(str(found))
     return replace(found.camera, provenance=Provenance("self-calibrated", round(found.deviation, 5), str(found)))
+
+
+def _search() -> list[Step]:
+    return [Step(f"finding the camera by the motion of {FRAMES} frames, then all else")]
 
 
 def _assumed(run: Run, size: tuple[int, int], fov: float, why: str) -> CameraModel:

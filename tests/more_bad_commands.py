@@ -247,6 +247,8 @@ MORE = [
     Command(f"demo {OUT} --size [1,1]", words="--size: [1, 1]"),
     Command(f"demo {OUT} --spurious 1.0", words="--spurious: 1.0"),
     Command(f"demo {OUT} --checkpoint HERE/nowhere", words="nowhere"),
+    Command(f"demo {OUT} --wrong-side 0", words="--wrong-side: 0"),
+    Command(f"demo {OUT} --dry-run", 2, "--dry-run"),
     Command(f"demo {OUT} --lens wide", 2, "expected one of pinhole"),
     Command(f"bench {OUT} --wrong-shares [1]", words="--wrong-shares"),
     Command(f"bench {OUT} --wrong-shares [0.1,0.1]", words="twice"),

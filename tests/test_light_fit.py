@@ -266,6 +266,7 @@ def test_the_verb_writes_a_light_that_can_be_read_and_a_report_with_nothing_left
     assert sorted(p.name for p in out.parent.iterdir()) == ["light.html", "light.json"]
     page = (out.parent / "light.html").read_text()
     assert "slope" not in page.split("<img")[0] and page.count("<img") == 2 and "standard deviation" in page
+    assert '<a href="light.json">light.json</a>' in page
     assert main(argv) == 3 and "already there" in capsys.readouterr().err
     assert main([*argv, "--overwrite"]) == 0
 

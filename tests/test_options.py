@@ -35,7 +35,7 @@ UNIT = re.compile(
 MORE = re.compile(r"(?:^|[.;] )(More|Larger|A larger|A higher|A longer|Another)\b")
 """A sentence on what a larger number does; of seeds and places, what another one does."""
 ROOT = Path(__file__).parents[1]
-GENERAL = ("help", "config", "print_config", "quiet", "json", "overwrite", "resume")
+GENERAL = ("help", "config", "print_config", "quiet", "json", "overwrite", "resume", "dry_run")
 
 
 @cache

@@ -132,6 +132,7 @@ def test_the_verb_writes_surfaces_timings_and_what_they_say(data, tmp_path, caps
     assert all(0 <= m["coverage"]["well_share"] <= 1 < m["coverage"]["area"] for m in record["maps"])
     told = capsys.readouterr().out
     assert "100% of 7 keyframes within 1e+06 ms" in told and f"verdict: {record['verdict']['colour']}" in told
+    assert f"next: lightdepth view {run}\n" in told
     counts = [m["ahead"]["new_points"]["count"] for m in record["maps"]]
     rows = list(csv.DictReader((run / "timings.csv").open()))
     assert sum(counts) == sum(int(r["new_points"]) for r in rows) > 0

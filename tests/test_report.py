@@ -14,7 +14,7 @@ from densify.evaluation.records import AlignedFigures, DistanceFigures, MapFigur
 from densify.judging.withheld import Withheld
 from densify.page import Gallery, densify_page
 from densify.pipeline import densify
-from lightdepth.reporting.figures import png
+from lightdepth.reporting.figures import chart, chart_png, png
 from lightdepth.reporting.report import Report, number
 
 PIXEL = png(np.zeros((1, 1, 3), np.uint8))
@@ -32,6 +32,28 @@ def test_a_page_has_its_parts_in_order_and_loads_nothing(tmp_path):
     parts = ["Title &amp; more</h1>", "First</h2>", "a &lt; b", "<table>", ">1.23<", ">–<", "a &quot;caption&quot;"]
     assert [text.index(p) for p in parts] == sorted(text.index(p) for p in parts)
     assert text.startswith("<!doctype html>") and [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_a_chart_is_light_on_dark_where_the_page_is_dark_and_an_image_stays_as_it_is(tmp_path):
+    figure, axes = chart((2, 1))
+    axes.plot([0, 1], [0, 1])
+    page = Report("Charts")
+    page.wide_figures([(chart_png(figure), "a chart"), (PIXEL, "an image")])
+    page.write(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert '<img class="chart" alt="a chart"' in text and '<img alt="an image"' in text
+    dark = text[text.index("prefers-color-scheme: dark") :]
+    assert "img.chart { filter: invert(" in dark
+
+
+def test_a_page_leads_to_the_files_beside_it_whatever_their_names(tmp_path):
+    page = Report("Links")
+    page.links([("a list & more.txt", "the <list>")])
+    page.write(tmp_path / "report.html")
+    assert (
+        '<a href="a%20list%20%26%20more.txt">a list &amp; more.txt</a>: the &lt;list&gt;'
+        in (tmp_path / "report.html").read_text()
+    )
 
 
 def test_what_comes_from_files_cannot_become_markup(tmp_path):

@@ -323,10 +323,13 @@ def test_the_verb_writes_list_table_page_and_pictures_and_nothing_over_what_is_t
     assert text.startswith("#") and f"{len(names)} of 18 frames kept" in text and "# min_matches: " in text
     assert f"{len(names)} of 18 frames kept" in capsys.readouterr().out
     assert cv2.imread(str(out.parent / "list_contact.png")).shape[1] > 1000
+    page = (out.parent / "list.html").read_text()
+    assert all(f'<a href="{name}">' in page for name in ("list.txt", "list.csv", "list_contact.png"))
     with refused(cure="--overwrite"):
         select(data, out)
     select(data, out, overwrite=True, no_frames=True, with_folder=True)
     assert not (out.parent / "list_contact.png").exists() and "<img" not in (out.parent / "list.html").read_text()
+    assert "list_contact.png" not in (out.parent / "list.html").read_text()
     assert read_frame_list(out) == [f"seq/{name}" for name in names]
 
 

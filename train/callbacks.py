@@ -1,4 +1,4 @@
-"""What a training run shows while it runs, and what stops it: pictures, progress, a diagnosis when it goes wrong."""
+"""What a training run says while it runs, and what stops it: progress, and a diagnosis when it goes wrong."""
 
 from __future__ import annotations
 
@@ -10,53 +10,16 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import lightning.pytorch as pl
-import numpy as np
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 
 from lightdepth.command_line.heartbeat import SECONDS
 from lightdepth.decline import informative, log_closed_form
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.frame import FrameBatch
-from lightdepth.losses import masked_median, render_image
 from lightdepth.losses.masked import masked_std
 from lightdepth.module import LightDepth
 from lightdepth.photometry import brightness
 from lightdepth.ranges import at_least, checked
-
-
-class Panels(pl.Callback):
-    """The first validation images, each a row: image, rendered, log distance, closed form, truth where there is any."""
-
-    def __init__(self, images: int = 4) -> None:
-        self.images = images
-
-    @torch.no_grad()
-    def on_validation_batch_end(
-        self,
-        trainer: pl.Trainer,
-        module: pl.LightningModule,
-        outputs: Any,
-        batch: FrameBatch,
-        batch_idx: int,
-        dataloader_idx: int = 0,
-    ) -> None:
-        logger = trainer.logger
-        if batch_idx > 0 or not trainer.is_global_zero or not isinstance(logger, TensorBoardLogger):
-            return
-        assert isinstance(module, LightDepth), type(module)
-        distance, albedo_hs = module(batch)
-        rendered = render_image(distance, albedo_hs, batch, module.loss_config)
-        closed_form = log_closed_form(batch.image, batch.mask, batch.rays, batch.light)
-        truth = batch.true_distance.clamp(min=1e-6).log()
-        maps = [(distance.log(), batch.mask), (closed_form, batch.mask), (truth, batch.true_valid)]
-        centred = [(values - masked_median(values, mask), mask) for values, mask in maps]
-        rows = []
-        for i in range(min(self.images, len(batch.image))):
-            pictures = [batch.image[i], rendered[i]]
-            pictures += [_coloured(values[i, 0], mask[i, 0]) for values, mask in centred]
-            rows.append(torch.cat([picture.float().cpu() for picture in pictures], -1))
-        logger.experiment.add_image("val/images", torch.cat(rows, -2).clamp(0, 1), trainer.global_step)
 
 
 class TrainingProgress(pl.Callback):
@@ -229,12 +192,3 @@ def _clock(seconds: float) -> str:
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
-
-
-def _coloured(log_distance: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """(H, W) centred log distance -> RGB (3, H, W), from half to thrice the median; black outside the mask."""
-    from matplotlib import colormaps
-
-    level = ((log_distance.float().cpu().numpy() + math.log(2)) / math.log(6)).clip(0, 1)
-    colour = colormaps["magma_r"](level)[..., :3] * mask.cpu().numpy()[..., None]
-    return torch.from_numpy(np.ascontiguousarray(colour.transpose(2, 0, 1))).float()

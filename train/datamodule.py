@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated, NamedTuple, cast
 
 import lightning.pytorch as pl
 import numpy as np
@@ -148,8 +149,24 @@ class FrameDataModule(pl.LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         if self._train is not None:
             return
-        train: list[Dataset[FrameBatch]] = []
-        val: list[Dataset[FrameBatch]] = []
+        opened = self.open_sequences()
+        train: list[Dataset[FrameBatch]] = [*opened.train]
+        val: list[Dataset[FrameBatch]] = [*opened.val]
+        if self.tube.scenes + self.tube.val_scenes > 0:
+            with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
+                to_train_on, to_validate_on = colon_seeds(self.tube, self.config.seed)
+                train += self._colons(tube_scene, to_train_on, bar)
+                val += self._colons(val_scene, to_validate_on, bar)
+        self._train, self._val = ConcatDataset(train), ConcatDataset(val)
+        most = int(np.clip(_LOOKED_AT // max(1, len(opened.listed)), 4, LOOKED_AT))
+        for path, frames, listed in opened.listed:
+            self.colours[path] = colours_of(frames, listed, most)
+
+    def open_sequences(self) -> Opened:
+        """Those to train and to validate on, and no colons. Raises InputError where there is, colons counted, nothing
+        to train or to validate on."""
+        train: list[_Frames] = []
+        val: list[_Frames] = []
         to_train, to_validate = self._folders()
         opened = [(path, open_listed(self.config.source, path, of)) for path, of in to_train]
         rows = [list(range(len(frames))) for _, frames in opened]
@@ -175,21 +192,14 @@ class FrameDataModule(pl.LightningDataModule):
                 val.append(_Frames(chosen[-held_out:], self.size, path))
         for path, of in to_validate:
             val.append(_Frames(open_listed(self.config.source, path, of), self.size, path))
-        if self.tube.scenes + self.tube.val_scenes > 0:
-            with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
-                to_train_on, to_validate_on = colon_seeds(self.tube, self.config.seed)
-                train += self._colons(tube_scene, to_train_on, bar)
-                val += self._colons(val_scene, to_validate_on, bar)
-        if not train:
+        if not train and not self.tube.scenes:
             raise InputError("data", "nothing to train on", "give --data.sequences FOLDER, or --data.tube.scenes N")
-        if not val:
+        if not val and not self.tube.val_scenes:
             raise InputError(
                 "data", "nothing to validate on", "give --data.val-sequences FOLDER, or --data.tube.val-scenes N"
             )
-        self._train, self._val = ConcatDataset(train), ConcatDataset(val)
-        most = int(np.clip(_LOOKED_AT // max(1, len(opened)), 4, LOOKED_AT))
-        for (path, frames), listed in zip(opened, rows, strict=True):
-            self.colours[path] = colours_of(frames, listed, most)
+        listed_of = [(path, frames, listed) for (path, frames), listed in zip(opened, rows, strict=True)]
+        return Opened(train, val, listed_of)
 
     @property
     def doubts(self) -> list[str]:
@@ -365,3 +375,24 @@ class _Cached(Dataset[FrameBatch]):
 
     def __getitem__(self, index: int) -> FrameBatch:
         return self.batches[index]
+
+
+class Opened(NamedTuple):
+    """The sequences of a run: what is trained and validated on, and each that trains with its rows that are used."""
+
+    train: list[_Frames]
+    val: list[_Frames]
+    listed: list[tuple[str, FrameSequence, list[int]]]
+
+    def counts(self, tube: TubeData) -> dict[str, int]:
+        """Number of frames to train and to validate on, colons among them."""
+        train, val = (sum(map(len, part)) for part in (self.train, self.val))
+        return {"train": train + tube.scenes * tube.frames, "val": val + tube.val_scenes * tube.frames}
+
+    def first(self) -> FrameBatch | None:
+        """A frame of them, the first that can be read; None where there is none."""
+        for part in (*self.train, *self.val):
+            for i in range(min(len(part), 5)):
+                with suppress(InputError):
+                    return part[i]
+        return None

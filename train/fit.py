@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import lightning.pytorch as pl
 import torch
@@ -23,6 +24,7 @@ import yaml
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from lightdepth.checkpoint import load_model, save_model
+from lightdepth.command_line.dry import is_dry
 from lightdepth.counting import counted
 from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.errors import InputError, Interrupted
@@ -34,20 +36,23 @@ from lightdepth.module import LightDepth
 from lightdepth.network import DepthNetwork
 from lightdepth.option_names import options_below
 from lightdepth.reporting.names import KEPT, Names, names_of
+from lightdepth.reporting.plan import Plan, untouched
 from lightdepth.reporting.record import versions, write_run_json
 from lightdepth.reporting.run import input_hash
 from lightdepth.signals import finishing_first
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
+from .board import hyper_parameters, opening
 from .callbacks import validation_line
 from .card import Card, Doubt
 from .checkpoints import BEST, LAST, Start, clear_cut_off, newest
 from .colons import TubeData
+from .costs import training_steps
 from .datamodule import FrameDataModule, warn
 from .folder import begin_in, first_process, has_checkpoint, training_folder
 from .going_on import settings_before, warn_of_length, warn_of_settings
 from .requeue import requeued
-from .running import quiet
+from .running import NO_ROOT, quiet
 from .trainer_options import check_trainer_options
 from .watching import Echo, FitConfig
 from .watching import with_callbacks as _with_callbacks
@@ -56,6 +61,7 @@ _PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mi
 
 
 _FIT = FitConfig()
+T = TypeVar("T")
 
 
 def fit(
@@ -86,6 +92,8 @@ def fit(
         )
     check_trainer_options(trainer_options)
     quiet()
+    if is_dry():
+        _planned(model, data, output, trainer_options, resume)
     job = _Job(config_yaml, seed, arguments or [], settings, resume)
     try:
         with training_folder(output, resume, overwrite, inputs) as folder:
@@ -95,6 +103,24 @@ def fit(
         left = error.kept or _left(output, resume or overwrite)
         error.kept = ". ".join(filter(None, (left, requeued(error.signal))))
         raise
+
+
+def _planned(
+    model: LightDepth, data: FrameDataModule, output: Path, trainer_options: Mapping[str, object], resume: bool
+) -> None:
+    """Ends a dry run: what is read is there, a Trainer takes its options, and no other run writes to the output."""
+    with untouched(output.resolve()):
+        opened = _opened(data.open_sequences)
+        unlogged = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        with _refusals_named(MisconfigurationException, ValueError, TypeError, RuntimeError):
+            pl.Trainer(**{"default_root_dir": NO_ROOT, **trainer_options, **unlogged})  # type: ignore[arg-type]  # the parser checked them
+        made = unfinished_path(output.resolve())
+        start = newest((made if made.is_dir() else output) / "checkpoints") if resume else None
+        counts, (width, height) = opened.counts(data.tube), data.size
+        what = f"{counted(counts['train'], 'frame')} to train on, {counts['val']} to validate on, {width}x{height}"
+        done = 0 if start is None else start.step
+        plan = Plan(output, again=f"going on: {start.said}" if start else "")
+        plan.ends(what, partial(training_steps, model, data, opened, trainer_options, done))
 
 
 @dataclass(frozen=True)
@@ -108,11 +134,11 @@ class _Job:
     resume: bool
 
 
-def _set_up(data: FrameDataModule) -> None:
-    """Opens its sequences; what cannot be opened is told with the options of train, which lie below --data."""
+def _opened(reads: Callable[[], T]) -> T:
+    """Opens sequences; what cannot be opened is told with the options of train, which lie below --data."""
     with options_below("data"):
         try:
-            data.setup()
+            return reads()
         except NoCamera as error:
             raise error.of_other_verb(error.where, maps=False) from error
 
@@ -126,7 +152,7 @@ def _fitted(
     start: Start | None,
 ) -> dict[str, float]:
     started = time.monotonic()
-    _set_up(data)
+    _opened(data.setup)
     asked = {"settings": yaml.safe_load(job.config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
     output = output_of(folder) or folder
     names = Names() if KEPT.get() else names_of(asked, (output, folder), argv=job.arguments)
@@ -149,9 +175,12 @@ def _fitted(
     data.tell = partial(_warned, echo)
     checkpoints = folder / "checkpoints"
     with finishing_first() as received:
-        options = _with_callbacks(trainer_options, folder, echo, data, job.settings, received, start)
+        board = hyper_parameters(model, data, trainer_options, job.seed)
+        options = _with_callbacks(trainer_options, folder, echo, data, job.settings, received, start, board)
         with _refusals_named(MisconfigurationException, ValueError, TypeError, RuntimeError):  # the last: of a cluster
             trainer = pl.Trainer(**options)  # type: ignore[arg-type]  # the parser checked them against Trainer
+        if shows := opening(trainer.logger, folder):
+            echo(shows)
         if job.resume:
             echo(start.said if start else "nothing to resume: starting anew")
         if start is not None:
@@ -172,6 +201,8 @@ def _fitted(
         final = f"train loss {float(train_loss):.4g}  " if train_loss is not None else ""
         echo(f"final: {final}{validation_line(found)}")
         record = _exported(model, data, folder, chosen, errors, job, echo)
+        if shows:
+            echo(opening(trainer.logger, output))
         sync_below(folder)  # run.json says that the rest is whole
         record["resumed"] = start is not None
         write_run_json(folder, "train", {"argv": names.command(job.arguments)}, started, record, names)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from lightdepth.command_line.dry import DRY_RUN
 from lightdepth.command_line.pages import PAGES
 from lightdepth.command_line.verbs import KEEP_NAMES
 from lightdepth.ranges import SEED
@@ -40,6 +41,7 @@ def training_parser() -> Parser:
     parser.add_argument("-o", "--output", required=True, help=_OUTPUT)
     parser.add_argument("--resume", action="store_true", help=_RESUME)
     parser.add_argument("--overwrite", action="store_true", help=_OVERWRITE)
+    parser.add_argument("--dry_run", action="store_true", help=DRY_RUN)
     parser.add_argument("--keep_names", action="store_true", help=KEEP_NAMES)
     parser.add_argument("--seed", type=int, default=0, help=_SEED)
     parser.add_class_arguments(LightDepth, "model")
@@ -61,7 +63,7 @@ def training_parser() -> Parser:
 def as_yaml(parser: ArgumentParser, config: Namespace) -> str:
     """The settings of a run, without where it goes and what becomes of what is there."""
     kept = config.clone()
-    for key in ("config", "preset", "output", "resume", "overwrite", "keep_names", "quiet", "json"):
+    for key in ("config", "preset", "output", "resume", "overwrite", "dry_run", "keep_names", "quiet", "json"):
         kept.pop(key, None)
     result: str = parser.dump(kept, skip_validation=True)
     return result

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 import lightning.pytorch as pl
@@ -19,7 +20,8 @@ from lightdepth.ranges import BELOW_ONE, at_least, checked
 from lightdepth.reporting.names import Names
 from lightdepth.signals import Received
 
-from .callbacks import Diagnosis, DiagnosisConfig, Panels, TrainingProgress
+from .board import Board
+from .callbacks import Diagnosis, DiagnosisConfig, TrainingProgress
 from .checkpoints import Checkpoints, Start, WholeCheckpoints
 from .datamodule import FrameDataModule
 from .folder import first_process
@@ -59,9 +61,10 @@ def with_callbacks(
     settings: FitConfig,
     received: Received,
     start: Start | None,
+    board: Mapping[str, str | float] = MappingProxyType({}),
 ) -> dict[str, object]:
     """Trainer options completed by the run's logger, checkpoints and progress. `received` tells of signals, `start`
-    where the run goes on."""
+    where the run goes on; `board` are settings for TensorBoard."""
     options = dict(given)
     interval, asked = options.get("val_check_interval"), options.get("max_steps")
     steps = asked if isinstance(asked, int) and asked else -1
@@ -71,7 +74,7 @@ def with_callbacks(
     monitor = None if settings.monitor == "last" else f"val/{settings.monitor}"
     every = interval if isinstance(interval, int) else 250
     extra: list[pl.Callback] = [
-        Panels(),
+        Board(board),
         Diagnosis(settings.diagnosis, data.names),
         TrainingProgress(echo, every=report_every(steps)),
     ]

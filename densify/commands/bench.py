@@ -22,6 +22,7 @@ from densify.bench.completion.scenes import IMAGE_SIZE as SIZES
 from densify.bench.completion.tables import notes as completion_notes
 from densify.bench.completion.tables import record as completion_record
 from densify.bench.completion.tables import tables as completion_tables
+from densify.bench.costs import bench_plan, completion_plan, per_frame_plan
 from densify.bench.curve_pictures import bench_picture
 from densify.bench.estimators import (
     NO_LIBRARY,
@@ -146,6 +147,7 @@ def run(
     models = load_models(compared.checkpoints, compared.device)
     with run_folder(output, "bench", arguments, overwrite, resume) as folder:
         folder.hash_inputs(**{checkpoint: Path(checkpoint) for checkpoint in compared.checkpoints})
+        folder.begins(*bench_plan(config))
         cells, seconds = _cells(folder, config, models)
         found = record(config, cells, seconds)
         _write_json(folder, "bench.json", found)
@@ -271,6 +273,7 @@ def compare_per_frame(
     bad: list[SpoiltFrame] = []
     with run_folder(output, "bench per-frame", arguments, overwrite, resume) as folder:
         folder.hash_inputs(colons=colons, **{checkpoint: Path(checkpoint) for checkpoint in compared.checkpoints})
+        folder.begins(*per_frame_plan(len(models), colons is None, spoilt))
         sequences = []
         with Progress("Frames", sum(colon.frames for colon in JUDGE_COLONS)) as bar:
             for colon in JUDGE_COLONS:
@@ -345,6 +348,7 @@ def compare_completions(
     config = DensifyConfig(**vars(method))
     with run_folder(output, "bench completion", arguments, overwrite, resume) as folder:
         folder.hash_inputs(checkpoint=Path(predicting.checkpoint), **folders)
+        folder.begins(*completion_plan(len(errors), image_size or SIZES[size]))
         cells, pictures = completed_cells(folder, model, config, errors, folders, inputs, image_size or SIZES[size])
         found = {**completion_record(cells), "config": config, "versions": versions(), "revision": git_revision()}
         _write_json(folder, "completion.json", found)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from densify.config import DensifyConfig
+from densify.demonstration import Planted, closing_lines
 from densify.densified import Densified
 from densify.evaluation.files import write_evaluations
 from densify.evaluation.in_short import in_short
@@ -19,7 +22,7 @@ from lightdepth.command_line.outcome import end
 from lightdepth.datasets import open_sequence
 from lightdepth.errors import InputError
 from lightdepth.maps import read_map
-from lightdepth.ranges import BELOW_ONE, COUNT, SEED, at_least
+from lightdepth.ranges import BELOW_ONE, COUNT, SEED, Range, at_least
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.tube import Lens, render_sequence
@@ -36,9 +39,10 @@ def demo(
     size: Annotated[tuple[int, int], at_least(8, up_to=10_000)] = (320, 256),
     lens: Lens = "c3vd",
     spurious: Annotated[float, BELOW_ONE] = 0.3,
+    wrong_side: Annotated[float, Range(0.1, 10)] = 1.4,
     overwrite: bool = False,
 ) -> None:
-    """The whole way on a synthetic colon: render, sparse map, densify, evaluate; ends at report.html.
+    """The whole way on a synthetic colon: render, sparse map, densify, evaluate; a good surface and a bad one.
 
     Args:
         output: Run folder to make, with the data, the surfaces and the report.
@@ -49,6 +53,8 @@ def demo(
         lens: Lens of the endoscope: pinhole (90 degrees across), telescope (70), fisheye (136) or c3vd (that of the
             data set C3VD).
         spurious: Share of the map points, in [0, 1), that are wrong. A larger one makes the map harder to densify.
+        wrong_side: Factor, from 0.1 to 10, by which points on one side of the first submap are too far away, so that
+            there is a bad surface to see too; 1 leaves them right. A larger one makes it worse.
         overwrite: Replace a run made before.
     """
     arguments = recorded(
@@ -59,6 +65,7 @@ def demo(
         size=size,
         lens=lens,
         spurious=spurious,
+        wrong_side=wrong_side,
     )
     config = SlamConfig("independent", spurious=spurious)
     model = predicting.load(details=False)
@@ -71,7 +78,8 @@ def demo(
                 seed, frames, tube_lens(lens, *size), 0.7 * frames, progress=lambda *_: bar.advance()
             )
         slam = simulate_slam(sequence.frames, config, seed)
-        write_synthetic(sequence.frames, slam, run.folder / "data")
+        planted = Planted.of(slam.map, wrong_side, seed)
+        write_synthetic(sequence.frames, replace(slam, map=planted.map), run.folder / "data", moved=planted.moved)
         data = open_sequence(run.folder / "data")
         sparse_map = read_map(run.folder / "data" / "slam")
         work = Densified.make(data, sparse_map, model, DensifyConfig())
@@ -80,8 +88,11 @@ def demo(
         write_evaluations({"demo": evaluation}, run.folder)
         run.log(in_short({"demo": evaluation}))
         run.record["evaluation"] = [found.record() for found in evaluation.judged.maps]
-        notes = [f"Verdict: {work.headline}."] if work.headline else []
-        notes += [
+        run.record["planted"] = planted.record()
+        verdicts = {result.dense.submap.id: result.verdict for result in work.results}
+        run.record["in_short"] = closing_lines(planted, verdicts, evaluation.judged.maps)
+        notes = [
+            *run.record["in_short"],
             f"A synthetic colon (seed {seed}), {frames} frames, a simulated SLAM export of {len(sparse_map.submaps)} "
             f"submaps with {spurious:.0%} wrong points; depth by {work.model}. Truth is exact, so errors are errors.",
         ]
@@ -95,4 +106,6 @@ def demo(
         )
         page.files(run.folder, FILES)
         page.write(run.folder / "report.html")
-    end(output, then="lightdepth import VIDEO -o DATA", page=output / "report.html")
+        for line in run.record["in_short"]:
+            run.log(line)
+    end(output, then=f"lightdepth view {quote(str(output))}", page=output / "report.html")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from shlex import quote
 
 from densify.config import DensifyConfig
+from densify.costs import surface_steps, surfaces_of
 from densify.densified import Densified
 from densify.inputs import MapSource, SurfaceFiles, doubts_of_inputs, fitted_light, map_and_frames
 from densify.joining import MergeConfig
@@ -63,6 +65,7 @@ def densify(
         run.hash_inputs(**source.files, map=mapped.map, checkpoint=Path(predicting.checkpoint))
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
         doubts = doubts_of_inputs(run, sparse_map, frames)
+        run.begins(surfaces_of(sparse_map, frames), partial(surface_steps, sparse_map, frames, model, fit_light))
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         work = Densified.make(frames, sparse_map, model, config, merging if merge else None, run)
         work.doubts = doubts

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from densify.config import LiveConfig
+from densify.costs import surface_steps, surfaces_of
 from densify.inputs import MapSource, doubts_of_inputs, fitted_light, map_and_frames
 from densify.live.play import play
 from densify.live.record import PlayedRun
@@ -70,9 +73,10 @@ def live(
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
         run.hash_inputs(**source.files, map=mapped.map)
         doubts = doubts_of_inputs(run, sparse_map, frames)
+        run.begins(surfaces_of(sparse_map, frames), partial(surface_steps, sparse_map, frames, model, fit_light))
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         result = PlayedRun(run, config.coverage, mm_per_unit, config.judge.on, doubts)
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:
             played = play(frames, sparse_map, model, config, result.add, rate, lambda _: bar.advance())
         result.finish(played, model.name, rate, budget_ms)
-    end(output, then="lightdepth densify DATA --map MAP -o runs/dense", page=output / "report.html")
+    end(output, then=f"lightdepth view {quote(str(output))}", page=output / "report.html")

@@ -11,6 +11,7 @@ from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged, Sour
 from densify.evaluation.suite import Suite
 from densify.evaluation.tables import Table, notes_of, tables_of
 from densify.judging.withheld import WithheldOfMap
+from lightdepth.reporting.figures import Chart
 from lightdepth.reporting.report import Report
 
 FILES = {
@@ -59,11 +60,11 @@ def evaluation_page(
     _show(report, short)
     for name, evaluation in found.items():
         prefix, of = prefix_of(name, found), f"{name}: " if len(found) > 1 else ""
-        pictures = []
+        pictures: list[tuple[bytes, str]] = []
         if evaluation.curves:
             share = "pixels" if isinstance(evaluation.judged, DepthJudged) else "model points"
             caption = f"{of}share of {share} within each error"
-            pictures.append(((folder / f"{prefix}{CURVES}.png").read_bytes(), caption))
+            pictures.append((Chart((folder / f"{prefix}{CURVES}.png").read_bytes()), caption))
         for mesh in evaluation.meshes:
             caption = f"{of}{mesh.name}, coloured by its distance to the true surface"
             pictures.append(((folder / f"{prefix}{mesh.name}_error.png").read_bytes(), caption))

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
+from lightdepth.command_line.dry import Planned
 from lightdepth.command_line.heartbeat import Heartbeat, beating
 from lightdepth.command_line.warned import heard
 from lightdepth.errors import Interrupted, WrongUsage
@@ -146,6 +147,15 @@ def end(
         call.last(f"written: {', '.join(for_line(str(path)) for path in written)}{opened}")
     elif not call.quiet:
         call.last("written: nothing")
+
+
+def planned(plan: Planned) -> None:
+    """The last lines of a dry run."""
+    call = outcome()
+    if not call.json:
+        for line in str(plan).splitlines():
+            call.last(line)
+    end(then="the same command without --dry-run", result=plan.record())
 
 
 def manners(words: Sequence[str]) -> tuple[Outcome, list[str]]:

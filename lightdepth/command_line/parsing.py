@@ -36,7 +36,7 @@ _GENERAL = {
     "print_config": "Print all settings, those given before it among them, as YAML that --config reads, and exit. "
     "`=skip_null` leaves out those that are not set.",
 }
-_LAST = ("overwrite", "resume", "quiet", "json", "config", "print_config", "help")
+_LAST = ("overwrite", "resume", "dry_run", "quiet", "json", "config", "print_config", "help")
 _GROUP = "YAML file with any of the options of this group."
 
 

@@ -9,6 +9,7 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lightdepth.command_line import dry
 from lightdepth.command_line.pages import PAGES, Page
 
 if TYPE_CHECKING:
@@ -101,6 +102,8 @@ def verb_parser(function: Any, verb: str) -> Parser:
         parser.add_argument("--overwrite", action="store_true", help=said.get("overwrite"))
     if "no_frames" in parameters:
         parser.add_argument("--no_frames", action="store_true", help=said.get("no_frames"))
+    if verb in dry.VERBS:
+        parser.add_argument("--dry_run", action="store_true", help=dry.DRY_RUN)
     if "output" in parameters and "keep_names" not in parameters:
         parser.add_argument("--keep_names", action="store_true", help=KEEP_NAMES)
     declared: set[str | int] = {name for name in ("output", "overwrite", "no_frames") if name in parameters}

@@ -77,6 +77,7 @@ def calibrate_light(
         fit = fit_on_map(frames, sparse_map, camera=given, rng=rng)
         what = f"{data}, {sparse_map.source}"
     page = light_page(fit, told(what, data=data, map=map))
+    page.links([(output.name, "the light, for --light of the other verbs")])
     write_together(
         {
             page_path: page.write,

@@ -9,6 +9,7 @@ asked to (`--keep-names`).
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from shlex import quote
 
@@ -16,8 +17,10 @@ import numpy as np
 
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
+from lightdepth.counting import counted
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import InputError
+from lightdepth.importing.costs import import_steps
 from lightdepth.importing.doubts import doubts, facts
 from lightdepth.importing.page import FILES, Picture, import_page
 from lightdepth.importing.pictures import Geometry, PictureConfig, write_pictures
@@ -75,10 +78,11 @@ def import_frames(
         run.check_inputs(**source.files, overlay_mask=overlay_mask)
         if opened.video is not None and choice.rate is None and choice.every is None:
             choice = replace(choice, rate=DEFAULT_RATE)
+        given_text = None if overlay_mask is None else read_overlay_mask(overlay_mask, opened)
+        run.begins(f"{counted(len(opened), 'frame')} would be measured", partial(import_steps, opened, frames))
         if not keep_names:
             run.record["command"] = ["lightdepth", "import", "(names left out; the options are in arguments)"]
         run.record["inputs"] = {"source": {"sha256_of_contents": content_hash(files)}}
-        given_text = None if overlay_mask is None else read_overlay_mask(overlay_mask, opened)
         regions = find_regions(opened, find_text, given_text, shape.deinterlace)
         scan = scanned(run, opened, regions.tissue, choice, shape.deinterlace)
         fate = selected(scan.times, scan.measures, choice)

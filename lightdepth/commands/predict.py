@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -11,9 +12,11 @@ import numpy as np
 
 from lightdepth.checkpoint import ModelSource
 from lightdepth.colour import ColourMeter
+from lightdepth.command_line.dry import Step
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
-from lightdepth.datasets import SequenceSource
+from lightdepth.counting import counted
+from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.depth_gate import DepthGate, sentence
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame
@@ -25,6 +28,7 @@ from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.reporting.batches import batches
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.names import names_of
+from lightdepth.reporting.plan import seconds_each, times
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.uncalibrated import open_frames
@@ -68,6 +72,8 @@ def predict(
     with run_folder(output, "predict", arguments, overwrite, resume) as run:
         run.hash_inputs(**source.files, checkpoint=Path(predicting.checkpoint), uncertainty=uncertainty)
         frames = open_frames(source, run).without_truth()
+        what = f"{counted(len(frames), 'frame')} of {frames.source} would be predicted by {model.name}"
+        run.begins(what, lambda: _steps(frames, model, previews))
         if previews:
             (run.folder / "previews").mkdir(exist_ok=True)
         nothing, meter, gate = 0, ColourMeter(), DepthGate()
@@ -116,15 +122,30 @@ def predict(
     end(output, then=f"lightdepth export {quote(str(output))} -o runs/png --to png")
 
 
+def _steps(frames: FrameSequence, model: DepthModel, previews: bool) -> list[Step]:
+    def made(frame: Frame) -> None:
+        prediction = model(frame)
+        prediction.save(BytesIO())
+        if previews:
+            _preview(frame, prediction)
+
+    return [Step(f"predicting {counted(len(frames), 'frame')}", times(len(frames), seconds_each(frames, made)))]
+
+
 def _written(folder: Path, frame: Frame, prediction: DepthPrediction, previews: bool) -> list[Path]:
     """The files of a frame."""
     file, preview = folder / f"{frame.name}.npz", folder / "previews" / f"{frame.name}.png"
     prediction.save(file)
     if not previews:
         return [file]
-    colors = colored_distance(prediction.distance, prediction.valid)
-    preview.write_bytes(png(side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)])))
+    preview.write_bytes(_preview(frame, prediction))
     return [file, preview]
+
+
+def _preview(frame: Frame, prediction: DepthPrediction) -> bytes:
+    """The image beside its distance (PNG)."""
+    colors = colored_distance(prediction.distance, prediction.valid)
+    return png(side_by_side([thumbnail(frame.image, 480), thumbnail(colors, 480)]))
 
 
 def _names(model: DepthModel, checkpoint: str) -> tuple[str, ...]:

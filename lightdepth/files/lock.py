@@ -67,6 +67,16 @@ def is_live(output: Path) -> bool:
         os.close(descriptor)
 
 
+def check_free(output: Path) -> None:
+    """Raises InputError as `locked` does where another run writes to `output`; makes no lock."""
+    if is_live(output):
+        with lock_path(output).open("rb") as file:
+            holder = _read(file.fileno())
+        raise InputError(
+            output, f"another run writes to it ({_told(holder)})", "wait for its end, or choose another -o"
+        )
+
+
 def is_lock(path: Path) -> bool:
     """Whether a file is a lock of ours."""
     try:

@@ -84,7 +84,7 @@ def _rows(measures: Measures) -> list[list[Any]]:
 def _charts(measures: Measures, fate: np.ndarray, axis: tuple[np.ndarray, str]) -> list[tuple[bytes, str]]:
     where, label = axis
     kept = fate == KEPT
-    drawn = []
+    drawn: list[tuple[bytes, str]] = []
     for title, series in (
         ("Sharpness; dots are the frames kept", [(measures.sharpness, "sharpness", 1)]),
         ("Brightness of the tissue, of 255", [(measures.brightness, "brightness", 1)]),

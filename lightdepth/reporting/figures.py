@@ -131,10 +131,14 @@ def chart(size: tuple[float, float] = (6.4, 3.0)) -> tuple[Any, Any]:
     return figure, axes
 
 
-def chart_png(figure: Any) -> bytes:
+class Chart(bytes):
+    """A PNG of lines and words on white, and of no image: a page that is dark shows it light on dark."""
+
+
+def chart_png(figure: Any) -> Chart:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+    return Chart(buffer.getvalue())
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import Any
 from urllib.parse import quote
 
 from lightdepth.foreign_text import for_terminal
+from lightdepth.reporting.figures import Chart
 from lightdepth.reporting.scene import Scene
 
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; base-uri 'none'"
@@ -64,11 +65,14 @@ class Report:
             for path in sorted(folder.glob(pattern))
             if path.is_file()
         ]
-        found += _OF_EVERY_RUN
+        self.links([*found, *_OF_EVERY_RUN])
+
+    def links(self, files: Sequence[tuple[str, str]]) -> None:
+        """Links to files by their path from the page, and what each is."""
         self.heading("Files")
-        links = (f'<li><a href="{quote(name)}">{_shown(name)}</a>: {_shown(said)}</li>' for name, said in found)
+        links = (f'<li><a href="{quote(name)}">{_shown(name)}</a>: {_shown(said)}</li>' for name, said in files)
         self._parts.append(f'<ul class="files">{"".join(links)}</ul>')
-        if any(name.endswith((".ply", ".obj", ".glb", ".stl")) for name, _ in found):
+        if any(name.endswith((".ply", ".obj", ".glb", ".stl")) for name, _ in files):
             self.text(f"Open surfaces and points with {_OPENERS}.")
 
     def scene(self, scene: Scene) -> None:
@@ -125,7 +129,9 @@ def _shown(text: str) -> str:
 def _figure(data: bytes, caption: str) -> str:
     source, kind = base64.b64encode(data).decode(), "jpeg" if data.startswith(_JPEG) else "png"
     text = _shown(caption)
-    return f'<figure><img alt="{text}" src="data:image/{kind};base64,{source}"><figcaption>{text}</figcaption></figure>'
+    drawn = ' class="chart"' if isinstance(data, Chart) else ""
+    image = f'<img{drawn} alt="{text}" src="data:image/{kind};base64,{source}">'
+    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
 
 
 def _header(text: str, of_words: bool) -> str:

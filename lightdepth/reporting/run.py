@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
+from lightdepth.command_line.dry import is_dry
 from lightdepth.command_line.outcome import outcome
 from lightdepth.command_line.warned import heard
 from lightdepth.counting import counted
@@ -38,11 +39,13 @@ from lightdepth.files.replacing import (
 from lightdepth.files.writing import folders_for, sync_below, usual_mode
 from lightdepth.foreign_text import for_line, for_terminal
 from lightdepth.reporting.names import KEPT, Names, names_of, spoken
+from lightdepth.reporting.plan import Plan, Work, untouched
 from lightdepth.reporting.record import write_run_json
 from lightdepth.reporting.same import check_finished, check_same, compared, fingerprint, own_version
 from lightdepth.reporting.same import input_hash as input_hash
 from lightdepth.reporting.same import paths_in as paths_in
 from lightdepth.reporting.same import plain as plain
+from lightdepth.reporting.same import recorded as recorded
 from lightdepth.reporting.unfinished import (
     Part,
     add_part,
@@ -81,6 +84,7 @@ class Run:
         self._warned: list[str] = []  # as they were told
         self._named = Names()
         self.unlisted: Mapping[str, Any] = {}  # inputs that do not stand among the arguments
+        self.plan: Plan | None = None  # of a dry run, which writes nothing
 
     @property
     def resumable(self) -> bool:
@@ -91,6 +95,11 @@ class Run:
     def state(self) -> Path:
         """A folder for files of parts that only a run that is resumed reads: it is gone from the finished run."""
         return self.folder / STATE
+
+    def begins(self, what: str, work: Work) -> None:
+        """All that is read was checked, and the work begins, `what` in words. A dry run ends here."""
+        if self.plan is not None:
+            self.plan.ends(what, work)
 
     def done(self, part: str) -> bool:
         """Whether a part was finished before: its files are there, and its failures and warnings are in the record
@@ -139,6 +148,8 @@ class Run:
         self._note(message, shown)
 
     def _note(self, message: str, shown: Callable[[str], str] = for_line) -> None:
+        if self.plan is not None:
+            return
         with (self.folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{time.strftime('%H:%M:%S')} {shown(message)}\n")
 
@@ -174,8 +185,8 @@ class Run:
         return fingerprint(self._verb, self._given, found)
 
     def _hashed(self, paths: Mapping[str, Path | None]) -> dict[str, dict[str, str]]:
-        found = {}
-        for name, path in paths.items():
+        found: dict[str, dict[str, str]] = {}
+        for name, path in paths.items() if self.plan is None else ():
             with suppress(OSError):  # whoever reads it says what is wrong with it
                 if path is not None and path.exists():
                     found[name] = {"path": str(path), "sha256": input_hash(path, self.output)}
@@ -183,7 +194,7 @@ class Run:
 
     def _note_inputs(self, inputs: Mapping[str, Any]) -> None:
         """A run that is resumed compares them."""
-        if self.parts is not None and not self.resumed:
+        if self.parts is not None and not self.resumed and self.plan is None:
             self.begin(inputs)
 
     def begin(self, inputs: Mapping[str, Any] | None = None) -> None:
@@ -231,12 +242,6 @@ class Run:
         clear_notes(self.folder)  # not before: a run that is killed until then goes on from its finished parts
 
 
-def recorded(*groups: object, **options: object) -> dict[str, object]:
-    """The options of a verb, by name, as run.json and config.yaml hold them: the fields of its groups (dataclasses),
-    then its own."""
-    return {name: value for group in groups for name, value in vars(group).items()} | options
-
-
 @contextmanager
 def run_folder(
     output: Path,
@@ -260,12 +265,16 @@ def run_folder(
     real = real_output(output)
     run = None
     try:
-        with folders_for([real]), locked(real), ExitStack() as ending:
+        with untouched(real) if is_dry() else _held(real), ExitStack() as ending:
             parts = _checked(real, verb, arguments, overwrite, resume, [*paths_in(arguments), *paths_in(inputs)])
             before = stamp(real)
             run = Run(unfinished_path(real), real, verb, arguments, None if resume is None else parts)
             run.keep_names = KEPT.get() if keep_names is None else keep_names
             run.unlisted = {"input": inputs}
+            if is_dry():
+                run.plan = Plan(output, len(parts))
+                yield run
+                raise AssertionError(f"{verb} does not say where its work begins")
             with kept_or_gone(run, real, resume is not None), run.hearing():
                 _begin(run)
                 yield run
@@ -291,6 +300,13 @@ def run_folder(
         )
 
 
+@contextmanager
+def _held(output: Path) -> Iterator[None]:
+    """The folder that it is in is made, and no other run writes to it."""
+    with folders_for([output]), locked(output):
+        yield
+
+
 def _checked(
     output: Path,
     verb: str,
@@ -300,12 +316,12 @@ def _checked(
     inputs: Iterable[Path],
 ) -> dict[str, Part]:
     """The finished parts that a run goes on from, after all that can be refused before any work."""
-    if recover(output):
+    if not is_dry() and recover(output):
         print(f"{output.name} was finished by an earlier run, which was killed at its last step", flush=True)
     made = unfinished_path(output)
     begun, parts = begun_with(made), finished_parts(made)
     if output.is_dir() and any(output.iterdir()):
-        if resume and read_record(made) is not None:
+        if resume and not is_dry() and read_record(made) is not None:
             put_finished(made, output, verb, arguments, inputs)
         if overwrite or (resume and begun is not None and parts):  # what goes on may have been begun by --overwrite
             check_apart(output, inputs)
@@ -316,7 +332,8 @@ def _checked(
             choices = "give --overwrite" if resume is None else "give --resume or --overwrite"
             raise InputError(output, "already there and not empty", f"choose another -o, or {choices}")
     parts = going_on(output, verb, arguments, overwrite, bool(resume), "holds an unfinished run")
-    try_place(output)
+    if not is_dry():
+        try_place(output)
     return parts
 
 
@@ -333,6 +350,8 @@ def going_on(
             raise InputError(output, f"{found} of {begun['verb']}", cure)
         check_same(output, begun, verb, arguments)
         return parts
+    if is_dry():
+        return {}
     discard(made)
     if resume and not output.is_file():  # a file that is there may be the finished one
         print("nothing to resume: starting anew", flush=True)

@@ -143,6 +143,12 @@ def input_hash(path: Path, without: Path | None = None) -> str:
     return digest.hexdigest()
 
 
+def recorded(*groups: object, **options: object) -> dict[str, object]:
+    """The options of a verb, by name, as run.json and config.yaml hold them: the fields of its groups (dataclasses),
+    then its own."""
+    return {name: value for group in groups for name, value in vars(group).items()} | options
+
+
 def plain(value: Any) -> Any:
     """Dataclasses, paths, tuples and numpy scalars as what JSON and YAML know."""
     if is_dataclass(value) and not isinstance(value, type):

@@ -16,6 +16,7 @@ from lightdepth.reporting.progress import Stages
 from lightdepth.reporting.report import number
 from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import SfmConfig
+from lightdepth.sfm.costs import mapping_steps
 from lightdepth.sfm.keeping import KeptDatabase
 from lightdepth.sfm.reconstruction import SOURCES, SfmMap, sparse_map_from_frames
 from lightdepth.sfm.unmapped import summary
@@ -32,6 +33,7 @@ def made_sparse(
     """A map by pycolmap, written to sparse/ in the run folder; `poses` (4, 4) by frame number, where they are known,
     and `files`, the names of the frames' own.
     Of a camera that nobody calibrated, camera.json beside it says so."""
+    run.begins(f"{counted(len(frames), 'frame')} would be mapped by pycolmap", partial(mapping_steps, frames, config))
     folder, database = run.folder / "sparse", KeptDatabase(run)
     with Stages("sparse map") as told:
         make = partial(sparse_map_from_frames, frames, folder, config, told, poses, database, files)

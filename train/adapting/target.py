@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -30,6 +31,7 @@ from lightdepth.sparse_map import SparseMap
 from ..datamodule import FrameData, FrameDataModule
 from .card import source_colons
 from .config import AdaptConfig
+from .costs import adapting_steps, learned_from
 from .exposure import check_exposed
 from .judging import parted
 from .map_teacher import MapTeacher
@@ -68,9 +70,10 @@ def read_target(
     start: NetworkModel,
     sfm: SfmConfig,
     pairing: PairingConfig = PairingConfig(),
+    more: Sequence[Path] = (),
 ) -> Target:
     """The frames and their map, given or made. Where nobody gave a light, the map's points may tell it; what was used
-    is written."""
+    is written. A dry run ends here, when the `more` sequences are opened too."""
     unjudged = ""
     sparse_map, frames = (None, source.open()) if map is None else open_with_map(source, map, pairing)
     training, held = parted(frames, config.held_out)
@@ -79,6 +82,10 @@ def read_target(
         sparse_map = by_the_images(sparse_map, frames)
         check_shared_frames(sparse_map, frames)
         check_pairing(sparse_map, frames, pairing, run, frames.first().camera if source.camera is not None else None)
+    run.begins(
+        learned_from(training, held, sparse_map), partial(adapting_steps, source, more, training, held, config, start)
+    )
+    if sparse_map is not None:
         write_camera(frames.first().camera, run.folder / "camera.json")
         # The map's camera, where the folder has none: for all sequences.
         source = replace(source, camera=run.folder / "camera.json")

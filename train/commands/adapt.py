@@ -100,7 +100,7 @@ def adapt(
     quiet()
     with run_folder(output, "adapt", arguments, overwrite, resume) as run:
         run.hash_inputs(**source.files, map=map, checkpoint=Path(checkpoint))
-        target = read_target(run, source, map, fit_light, config, start, sfm, pairing)
+        target = read_target(run, source, map, fit_light, config, start, sfm, pairing, more)
         size = config.size or working_size(target.frames.first().camera, start.rows)
         data = frame_data(run, target, more, config, size, start)
         for doubt in data.doubts:

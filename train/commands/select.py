@@ -61,6 +61,12 @@ from ..selecting.matching import (
 )
 
 _SHOWN = 48  # pictures of kept and of rejected frames each
+_FILES = {
+    "list": "the names of the kept frames, for train --data.frames",
+    "table": "every frame, with its figures and why it is kept or not",
+    "sheet": "pictures of kept and rejected frames",
+}
+"""What is written beside the page, of `_paths`."""
 
 
 @dataclass(frozen=True)
@@ -158,9 +164,11 @@ def select(
         listed += chosen
         picture = None if no_frames else _sheet(frames, verdicts)
         doubts = tuple(told(doubt, data=data, map=map) for doubt in doubts)
+        page = _page(f"{shown}, {header[0]}: {summary}.", header[1:], verdicts, picture, doubts)
+        page.links([(paths[what].name, said) for what, said in _FILES.items() if what != "sheet" or not no_frames])
         writers: dict[Path, Content] = {
             paths["table"]: _table(verdicts),
-            paths["page"]: _page(f"{shown}, {header[0]}: {summary}.", header[1:], verdicts, picture, doubts).write,
+            paths["page"]: page.write,
             paths["list"]: "\n".join(listed) + "\n",  # last: its presence means all is there
         }
         if picture is not None:

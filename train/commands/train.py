@@ -11,6 +11,7 @@ from shlex import quote
 
 import lightning.pytorch as pl
 
+from lightdepth.command_line.dry import DRY
 from lightdepth.command_line.gone_settings import without_gone
 from lightdepth.command_line.mistakes import fail
 from lightdepth.command_line.outcome import end, outcome
@@ -41,6 +42,7 @@ def train(argv: list[str] | None = None) -> int:
     )
     config = parsed(parser, argv)
     KEPT.set(config.keep_names)
+    DRY.set(config.dry_run)
 
     output = Path(config.output)
     inputs = paths_in(config.as_dict())
