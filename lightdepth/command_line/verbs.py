@@ -31,6 +31,7 @@ ORDER = (
     "predict",
     "sparse",
     "densify",
+    "batch",
     "live",
     "evaluate",
     "bench",
