@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +60,41 @@ def batch(manifest: object, output: Path, *more: object, quick: tuple[str, ...] 
         return main(["batch", str(manifest), "-o", str(output), *quick, *map(str, (*jobs, *more))])
     except SystemExit as stopped:
         return int(stopped.code or 0)
+
+
+def words(
+    manifest: object, output: Path, *more: object, quick: tuple[str, ...] = QUICK, real: bool = True
+) -> list[str]:
+    """The verb as a command line of a process of its own; `real` false makes its runs in an instant, one by one."""
+    program = ["-m", "lightdepth"] if real else [str(Path(__file__).with_name("quick_batch.py"))]
+    jobs = [] if real else ["--jobs", "0"]
+    return [sys.executable, *program, "batch", str(manifest), "-o", str(output), *quick, *jobs, *map(str, more)]
+
+
+def called(*given: object, **named: Any) -> tuple[int, float]:
+    """Exit code and seconds of the verb in a process of its own."""
+    start = time.monotonic()
+    done = subprocess.run(words(*given, **named), check=False, env=environment(), capture_output=True)
+    return done.returncode, time.monotonic() - start
+
+
+def killed_after(count: int, *given: Any, **named: Any) -> int:
+    """The verb in a process of its own, which is killed when so many runs are finished, and its workers see that it is;
+    how many are finished then."""
+    output: Path = given[1]
+    with subprocess.Popen(words(*given, **named), env=environment(), stderr=subprocess.DEVNULL) as one:
+        while len(stamps(output)) < count:
+            assert one.poll() is None, "it ended before"
+            time.sleep(0.02)
+        children = Path(f"/proc/{one.pid}/task/{one.pid}/children").read_text().split()
+        one.send_signal(signal.SIGKILL)
+    while any(Path(f"/proc/{child}/maps").exists() and Path(f"/proc/{child}/maps").read_bytes() for child in children):
+        time.sleep(0.02)
+    return len(stamps(output))
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
 
 
 def table(output: Path) -> list[dict[str, Any]]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import shutil
 from pathlib import Path
 
 import pytest
-from sequences import batch, made_sequences, quick_run, read_table, stamps, table
+from sequences import batch, called, killed_after, made_sequences, quick_run, read_table, stamps, table
 from test_names import telling
 
 import densify.batch.make
@@ -263,3 +264,20 @@ def test_an_input_error_names_its_row(tmp_path):
     with pytest.raises(InputError) as caught:
         read_manifest(tmp_path / "list.csv", tmp_path / "out")
     assert "row 3" in caught.value.where and "trust_map" in caught.value.found
+
+
+@pytest.mark.slow
+def test_a_share_that_is_killed_and_resumed_beside_another_makes_the_table_of_one_run(data, tmp_path):
+    many, count = tmp_path / "many", int(os.environ.get("SEQUENCES", 12))
+    for number in range(count):
+        shutil.copytree(sorted(data.iterdir())[number % 4], many / f"{CANARY}_{number:02d}")
+    assert called(many, tmp_path / "whole", real=False)[0] == 0
+    there = killed_after(count // 4, many, tmp_path / "out", "--shard", "1/2", real=False)
+    kept = stamps(tmp_path / "out")
+    assert count // 4 <= there < count // 2
+    assert called(many, tmp_path / "out", "--shard", "2/2", real=False)[0] == 0
+    assert len(stamps(tmp_path / "out")) == there + count // 2
+    assert called(many, tmp_path / "out", "--shard", "1/2", real=False)[0] == 0
+    assert {name: stamps(tmp_path / "out")[name] for name in kept} == kept
+    assert table(tmp_path / "out") == table(tmp_path / "whole") and len(stamps(tmp_path / "out")) == count
+    assert [path.name for path in (tmp_path / "out" / "sequences").glob(".*")] == []

@@ -55,8 +55,7 @@ class SlurmConfig:
     memory_gb: Annotated[float, above(0)] = 8.0
     """Memory of a job, gigabytes. More are needed for long sequences and large frames."""
     gpus: Annotated[int, at_least(0)] = 0
-    """Number of GPUs of a job. One or more run the network on one GPU (--device cuda); all else stays on the
-    processor."""
+    """Number of GPUs of a job, on one of which the network runs (--device cuda or auto). More than 1 are of no use."""
 
 
 class Share(Generic[Task, Result]):
@@ -138,8 +137,8 @@ def _answers(job: Any, count: int) -> list[Any]:
     return found
 
 
-def _parameters(config: SlurmConfig, threads: int, cluster: str) -> dict[str, Any]:
-    given: dict[str, Any] = {"timeout_min": config.minutes, "name": "lightdepth-batch"}
+def _parameters(config: SlurmConfig, threads: int, cluster: str) -> dict[str, object]:
+    given: dict[str, object] = {"timeout_min": config.minutes, "name": "lightdepth-batch"}
     if cluster != "slurm":
         return given
     given |= {"cpus_per_task": threads, "mem_gb": config.memory_gb, "slurm_signal_delay_s": 120}

@@ -144,7 +144,7 @@ def _value(where: str, column: str, cell: str) -> Any:
 
 
 @cache
-def _kinds() -> dict[str, Any]:
+def _kinds() -> Mapping[str, Any]:
     """The options that a row may have, with the types of their values."""
     return dict(_of_fields())
 

@@ -21,6 +21,7 @@ from lightdepth.reporting.names import Names
 from lightdepth.reporting.report import Report
 
 STATES = ("done", "in part", "failed", "elsewhere", "waiting")
+_COUNTED = ("keyframes", "aligned", "vertices")
 COLOURS = ("green", "amber", "red")
 _FILES = {
     TABLE: "the table for spreadsheets",
@@ -60,6 +61,7 @@ def line_of(unit: Unit, ended: Ended | None, output: Path, names: Names) -> Line
     record = read_record(output / SEQUENCES / unit.name) or {}
     found = record.get("verdict") or {}
     maps = [each for each in record.get("maps") or [] if isinstance(each, Mapping)]
+    keyframes, aligned, vertices = (sum(each.get(name) or 0 for each in maps) for name in _COUNTED)
     return Line(
         unit.name,
         ended.state,
@@ -68,7 +70,9 @@ def line_of(unit: Unit, ended: Ended | None, output: Path, names: Names) -> Line
         min((each["coverage"]["well_share"] for each in maps if each.get("coverage")), default=None),
         len(maps),
         frames,
-        *(sum(each.get(name) or 0 for each in maps) for name in ("keyframes", "aligned", "vertices")),
+        keyframes,
+        aligned,
+        vertices,
         record.get("seconds"),
         for_line(ended.error),
     )

@@ -114,20 +114,20 @@ def check_files_of_all(source: SequenceSource, mapped: MapSource) -> None:
 def _asked_of(row: Row, asked: Asked) -> Asked:
     """What is asked of one row."""
     try:
-        source = SequenceSource(**_over(asked.source, row.given) | {"data": row.data})
-        mapped = _over(asked.mapped, row.given)
-        if "map" not in row.given and mapped["map"] is not None:
-            beside = row.data.parent if row.data.is_file() else row.data
-            mapped["map"] = beside / mapped["map"]
+        source = SequenceSource(**{**_over(asked.source, row.given), "data": row.data})
+        mapped = asked.mapped.map
+        if mapped is not None:
+            mapped = (row.data.parent if row.data.is_file() else row.data) / mapped
+        own = MapSource(**_over(asked.mapped, {"map": mapped, **row.given}))
         scale = row.given.get("mm_per_unit", asked.files.mm_per_unit)
-        made = replace(asked, source=source, mapped=MapSource(**mapped), files=replace(asked.files, mm_per_unit=scale))
+        made = replace(asked, source=source, mapped=own, files=replace(asked.files, mm_per_unit=scale))
         _ = source.asks_for_camera  # which refuses two of them
     except InputError as error:
         raise error.within(f"row {row.number} of the manifest") from error
     return made
 
 
-def _over(settings: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+def _over(settings: Any, given: Mapping[str, Any]) -> Mapping[str, Any]:
     """The fields of settings, those of a row in their place."""
     return {each.name: given.get(each.name, getattr(settings, each.name)) for each in fields(settings)}
 
@@ -143,7 +143,7 @@ def _digits(extent: Extent, given: Mapping[str, Any]) -> str:
     """Eight digits of a sequence and of the options of its own, whose files count by their contents."""
     digest = hashlib.sha256(extent.digits.encode())
     for option, value in sorted(given.items()):
-        path = Path(value) if isinstance(value, str | Path) else None
-        there = path is not None and path.exists()
-        digest.update(f"{option}\0{digits_of(path) if path is not None and there else value}\0".encode())
+        file = Path(str(value)) if option in ("map", "camera", "mask", "light") else None
+        told = digits_of(file) if file is not None and file.exists() else value
+        digest.update(f"{option}\0{told}\0".encode("utf-8", "surrogateescape"))
     return digest.hexdigest()[:8]

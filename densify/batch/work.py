@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from densify.batch.cluster import SlurmConfig, check_cluster, submitted
 from densify.batch.folder import JOBS, begin, check_ours, in_turn
@@ -81,7 +81,7 @@ def batch_run(batch: Batch, running: Running) -> list[Line]:
         begin(output, batch.arguments)
         check_ours(output)
         before = {unit.name: ended_before(unit, output) for unit in share}
-        todo = [unit for unit in share if (ended := before[unit.name]) is None or ended.state == "failed"]
+        todo = [unit for unit in share if (one := before[unit.name]) is None or one.state == "failed"]
         if todo:
             (output / RECORD).unlink(missing_ok=True)  # it says that nothing is left to be done
         _write_names(batch)
@@ -133,13 +133,11 @@ def _tried(batch: Batch, running: Running, todo: Sequence[Unit]) -> Iterator[tup
         yield from worked(todo, batch.maker, running.jobs, running.threads)
 
 
-def _on_cluster(
-    batch: Batch, running: Running, todo: Sequence[Unit], cluster: str = "slurm"
-) -> Iterator[tuple[Unit, Ended | Lost]]:
+def _on_cluster(batch: Batch, running: Running, todo: Sequence[Unit]) -> Iterator[tuple[Unit, Ended | Lost]]:
     folder = batch.output / JOBS
     folder.mkdir(mode=0o700, exist_ok=True)  # paths of inputs are in it
     shares = [share_of(todo, (i, running.jobs)) for i in range(1, running.jobs + 1)]
-    yield from submitted(shares, batch.maker, running.slurm, folder, running.threads, cluster)
+    yield from submitted(shares, batch.maker, running.slurm, folder, running.threads)
     discard(folder)
 
 
@@ -171,7 +169,7 @@ def _write_record(batch: Batch, lines: Sequence[Line], start: float) -> None:
     if any(line.state in ("waiting", "elsewhere") for line in lines):
         return
     names = Names() if batch.maker.keep_names else names_of(batch.arguments, (batch.output,))
-    record: dict[str, Any] = {
+    record = {
         "command": ["lightdepth", "batch"],  # its words may be names of patients
         "sequences": len(lines),
         "summary": summary(lines),

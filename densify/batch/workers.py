@@ -70,7 +70,7 @@ def worked(
                 _give(hands[-1], waiting.popleft())
             busy = {hand.line: hand for hand in hands if hand.task is not None}
             for line in connection.wait(list(busy)):
-                hand = busy[line]  # type: ignore[index]  # what we waited for
+                hand = busy[line]
                 task, result = _taken(hand)
                 if isinstance(result, Lost):
                     hands.remove(hand)

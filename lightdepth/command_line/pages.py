@@ -124,7 +124,7 @@ PAGES = {
     "batch": Page(
         (
             "lightdepth batch data -o runs/night --map slam --jobs 4",
-            "lightdepth batch procedures.csv -o runs/all --shard 2/8 --config settings.yaml",
+            "lightdepth batch procedures.csv -o runs/all --shard 2/8 --merging.by points",
         ),
         rare=("keep_mb", "threads", "bit_depth", "trust_map", "recipe", "fov"),
     ),
