@@ -227,6 +227,18 @@ def test_a_table_gives_each_sequence_options_and_a_name_of_its_own(data, tmp_pat
     }
 
 
+def test_settings_of_densify_in_a_file_serve_for_each_sequence(data, tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(densify.batch.make, "dense_run", lambda *a, **g: made.append(a[0]) or quick_run(*a, **g))
+    (tmp_path / "c.yaml").write_text("formats: [ply, obj]\nfusion: {voxels_per_distance: 30}\noutput: elsewhere\n")
+    (tmp_path / "notes.txt").write_text("no sequence")
+    shutil.copytree(data, tmp_path / "here" / "data")
+    with pytest.warns(UserWarning, match="given with each run"):
+        assert batch(f"{tmp_path}/*/*/*_0[01]", tmp_path / "out", "--config", tmp_path / "c.yaml") == 0
+    assert [asked.config.fusion.voxels_per_distance for asked in made] == [30, 30]
+    assert {asked.files.formats for asked in made} == {("ply", "obj")}
+
+
 def test_copies_are_two_sequences_and_the_same_row_twice_is_one(data, tmp_path, capsys):
     first = sorted(data.iterdir())[0]
     shutil.copytree(first, tmp_path / "copy")
@@ -234,7 +246,7 @@ def test_copies_are_two_sequences_and_the_same_row_twice_is_one(data, tmp_path, 
     assert batch(tmp_path / "list.csv", tmp_path / "out") == 0
     one, two = read_table(tmp_path / "out")
     assert two["sequence"] == f"{one['sequence']}-2" and one["vertices"] == two["vertices"]
-    assert "1 row of the manifest stand" in (tmp_path / "out" / "report.html").read_text()
+    assert "The manifest repeats 1 row." in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_the_checkpoint_is_loaded_once_for_all_sequences_of_a_process(data, tmp_path, monkeypatch):

@@ -27,7 +27,9 @@ from densify.inputs import MapSource, SurfaceFiles
 from lightdepth.datasets import SequenceSource
 from lightdepth.datasets.extent import sequences_below
 from lightdepth.datasets.reading import is_sequence
+from lightdepth.datasets.video_sequence import video_at
 from lightdepth.errors import InputError
+from lightdepth.files.below import is_result
 from lightdepth.files.reading import MOST_TEXT, check_bytes, reading
 from lightdepth.regular import regular
 
@@ -65,12 +67,19 @@ def read_manifest(manifest: Path, output: Path) -> list[Row]:
     elif manifest.exists():
         raise InputError(manifest, "is a file", "expected a folder of sequences, a pattern, or a table (.csv)")
     elif _MAGIC.search(found):
-        paths = [path for path in map(Path, sorted(glob.glob(found, recursive=True))) if path.resolve() != output]
+        paths = [path for path in map(Path, sorted(glob.glob(found, recursive=True))) if _may_be_one(path, output)]
     else:
         raise InputError(manifest, "does not exist", "expected a folder of sequences, a pattern, or a table (.csv)")
     if not paths:
         raise InputError(manifest, "no sequence in it", "expected folders of frames, or videos")
-    return [Row(number, Path(os.path.abspath(path))) for number, path in enumerate(paths, 1)]
+    return [Row(number, path) for number, path in enumerate(paths, 1)]
+
+
+def _may_be_one(path: Path, output: Path) -> bool:
+    """Whether what a pattern matches may be a sequence: no result of a run, and no file but a video."""
+    if path.is_file():
+        return video_at(path) is not None
+    return not is_result(path) and path.resolve() != output
 
 
 def _rows_of_table(table: Path) -> list[Row]:
@@ -125,10 +134,10 @@ def _row(table: Path, where: str, number: int, cells: Mapping[str, str]) -> Row:
         raise InputError(where, f"name {name[:40]!r}", "expected letters, digits, dots, dashes and underscores")
     for option in _PATHS:
         if option in given and not (option == "camera" and given[option] == Path("auto")):
-            given[option] = Path(os.path.abspath(table.parent / given[option]))
+            given[option] = Path(os.path.normpath(table.parent / given[option]))
     light = given.get("light")
     if light is not None and "=" not in light:
-        given["light"] = os.path.abspath(table.parent / light)
+        given["light"] = os.path.normpath(table.parent / light)
     return Row(number, given.pop("data"), given, name)
 
 

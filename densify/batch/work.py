@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,10 +18,10 @@ from densify.batch.units import Unit, parsed_share, share_of
 from densify.batch.workers import Lost, pinned_threads, worked
 from lightdepth.command_line.outcome import is_quiet, outcome
 from lightdepth.counting import counted
-from lightdepth.errors import InputError
+from lightdepth.errors import InputError, Interrupted
 from lightdepth.files.named_inputs import real_inputs, write_inputs
 from lightdepth.files.replacing import RECORD, discard
-from lightdepth.files.writing import folders_for
+from lightdepth.files.writing import folders_for, our_mark
 from lightdepth.foreign_text import for_line
 from lightdepth.ranges import COUNT, at_least, checked
 from lightdepth.reporting.names import Names, names_of
@@ -87,7 +88,11 @@ def batch_run(batch: Batch, running: Running) -> list[Line]:
         _write_names(batch)
     of = f" of {len(batch.units)}" if running.shard else ""
     _say(f"{counted(len(share), 'sequence')}{of}, {len(share) - len(todo)} of them already made")
-    ended = {unit.name: one for unit, one in _made(batch, running, todo)}
+    try:
+        ended = {unit.name: one for unit, one in _made(batch, running, todo)}
+    except Interrupted as error:
+        error.kept = "finished sequences are kept: the same command goes on"
+        raise
     with in_turn(output):
         lines = {unit.name: _line(unit, ended.get(unit.name), batch) for unit in batch.units}
         clear_locks((unit for unit in share if lines[unit.name].state == "done"), output)
@@ -134,17 +139,23 @@ def _tried(batch: Batch, running: Running, todo: Sequence[Unit]) -> Iterator[tup
 
 
 def _on_cluster(batch: Batch, running: Running, todo: Sequence[Unit]) -> Iterator[tuple[Unit, Ended | Lost]]:
-    folder = batch.output / JOBS
-    folder.mkdir(mode=0o700, exist_ok=True)  # paths of inputs are in it
+    above = batch.output / JOBS
+    folder = above / f"{our_mark()}{len(todo)}"
+    above.mkdir(mode=0o700, exist_ok=True)  # paths of inputs are in it
     shares = [share_of(todo, (i, running.jobs)) for i in range(1, running.jobs + 1)]
     yield from submitted(shares, batch.maker, running.slurm, folder, running.threads)
     discard(folder)
+    with suppress(OSError):  # another run's are in it
+        above.rmdir()
 
 
 def _line(unit: Unit, ended: Ended | None, batch: Batch) -> Line:
     """What the files say of a unit, or, where they say nothing, what we saw."""
     names = Names() if batch.maker.keep_names else Names(unit.paths, (batch.output,))
-    return line_of(unit, ended_before(unit, batch.output) or ended, batch.output, names)
+    before = ended_before(unit, batch.output)
+    if ended is not None and ended.state == "elsewhere" and (before is None or before.state == "failed"):
+        return line_of(unit, ended, batch.output, names)  # it failed before, and another try is made of it
+    return line_of(unit, before or ended, batch.output, names)
 
 
 def _in_short(unit: Unit, ended: Ended, batch: Batch) -> str:

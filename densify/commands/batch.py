@@ -83,7 +83,7 @@ def batch(
     inside = None if mapped.map is None else f"in each: {mapped.map}"
     settings = recorded(source, predicting, config, files, sfm=sfm, fit_light=fit_light, merge=merge, merging=merging)
     arguments = {**settings, **vars(mapped), "map": inside, "data": None}
-    same = [f"{counted(len(rows) - len(units), 'row')} of the manifest stand there twice."] * (len(rows) > len(units))
+    same = [f"The manifest repeats {counted(len(rows) - len(units), 'row')}."] * (len(rows) > len(units))
     work = Batch(units, place, Maker(predicting, place, KEPT.get()), arguments, same)
     lines = batch_run(work, running)
     if failures := told_failures(lines):
