@@ -37,6 +37,10 @@ class MissingOption(InputError):
     """An option that has to be given and was not: wrong usage. Exit code 2."""
 
 
+class InUse(InputError):
+    """An output that another run writes to now. Exit code 3; `batch` leaves it to that run."""
+
+
 class WrongUsage(SystemExit):
     """Wrong words on the command line, of which a line has told. Exit code 2."""
 

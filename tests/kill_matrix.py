@@ -78,6 +78,13 @@ VERBS = (
     ),
     Verb("sparse", ("sparse", "wide", "-o", "out"), "out", ("--sfm.peak-threshold", "0.004"), resumes=True),
     Verb("densify", ("densify", "synth", "-o", "out", *ON_MAP), "out", ("--no-merge",), resumes=True),
+    Verb(
+        "batch",
+        ("batch", "many", "-o", "out", "--map", "slam", "--checkpoint", "decline", "--jobs", "0"),
+        "out",
+        overwrites=False,
+        in_place=True,
+    ),
     Verb("live", ("live", "synth", "-o", "out", *ON_MAP), "out", ("--mm-per-unit", "2")),
     Verb("evaluate", ("evaluate", "predict", "--truth", "synth", "-o", "out"), "out", ("--max-depth-mm", "20")),
     Verb(
@@ -122,6 +129,8 @@ SCENE = ("--seed", "3", "--slam.kind", "independent", "--slam.keyframe-every", "
 MADE = (
     ("synth", ("synth", "-o", "synth", "--frames", "10", "--size", "[96, 80]", *SCENE)),
     ("wide", ("synth", "-o", "wide", "--frames", "16", "--size", "[160, 128]", *SCENE)),
+    ("many/a", ("synth", "-o", "many/a", "--frames", "6", "--size", "[96, 80]", *SCENE)),
+    ("many/b", ("synth", "-o", "many/b", "--frames", "7", "--size", "[96, 80]", *SCENE)),
     ("predict", ("predict", "synth", "-o", "predict", "--checkpoint", "decline")),
     ("dense", ("densify", "synth", "-o", "dense", *ON_MAP)),
 )
@@ -137,7 +146,7 @@ def import_all(quick: bool = False) -> None:
     modules = [f"lightdepth.commands.{name}" for name in ("import_frames", "predict", "synth")] + ["lightdepth.cli"]
     if not quick:
         modules += [f"train.commands.{name}" for name in ("adapt", "train")]
-        modules += [f"densify.commands.{name}" for name in ("bench", "demo", "densify", "live")]
+        modules += [f"densify.commands.{name}" for name in ("batch", "bench", "demo", "densify", "live")]
     for name in modules:
         importlib.import_module(name)
     import PIL.Image

@@ -5,6 +5,7 @@ from bad_commands import DATA, DECLINE, HIDDEN, OUT, Command
 SMALL = "--scene.shape.step 1.2 --scene.shape.length 90 --scene.texture.resolution 0.4"
 SYNTH = f"synth {OUT} --frames 4 --slam.keyframe-every 1 --size [24,20] {SMALL}"
 DENSIFY = f"densify {DATA} --map HERE/colmap {DECLINE} {OUT}"
+BATCH = f"batch HERE {DECLINE} --jobs 0 {OUT}"
 LIVE = f"live {DATA} --map HERE/colmap {DECLINE} {OUT}"
 PREDICT = f"predict {DATA} {DECLINE} {OUT}"
 IMPORT = f"import {DATA} {OUT}"
@@ -68,6 +69,34 @@ MORE = [
     Command(f"{DENSIFY} --light HERE/bad/text.xml", words="text.xml"),
     Command(f"{DENSIFY} --light HERE/bad/empty.json", words="empty.json"),
     Command(f"{DENSIFY} --light HERE/bad/folder", words="folder"),
+    # ---- many sequences
+    Command(f"batch HERE/nowhere {OUT}", words="nowhere"),
+    Command(f"batch HERE/no*where {OUT}", words="no*where: no sequence in it"),
+    Command(f"batch HERE/frames {OUT}", words="is one sequence"),
+    Command(f"batch HERE/bad/folder {OUT}", words="no sequence in it"),
+    Command(f"batch HERE/bad/empty.csv {OUT}", words="empty.csv"),
+    Command(f"batch HERE/bad/text.csv {OUT}", words="text.csv"),
+    Command(f"batch HERE/bad/bytes.csv {OUT}", words="bytes.csv"),
+    Command(f"batch HERE/bad/text.json {OUT}", words="text.json: is a file"),
+    Command(f"batch {OUT}", 2, "missing: DATA"),
+    Command(f"{BATCH} --shard 0/4", words="--shard: '0/4'"),
+    Command(f"{BATCH} --shard 5/4", words="--shard: '5/4'"),
+    Command(f"{BATCH} --shard half", words="--shard: 'half'"),
+    Command(f"{BATCH} --jobs -1", words="--jobs: -1"),
+    Command(f"{BATCH} --jobs many", 2, "expected a whole number"),
+    Command(f"{BATCH} --threads 0", words="--threads: 0"),
+    Command(f"{BATCH} --executor slurm", words="--jobs: 0, with --executor slurm"),
+    Command(f"{BATCH} --executor dask", 2, "expected one of local, slurm"),
+    Command(f"{BATCH} --slurm.minutes 0", words="--slurm.minutes: 0"),
+    Command(f"{BATCH} --map HERE/colmap", words="would be the map of all"),
+    Command(f"{BATCH} --camera HERE/nowhere.json", words="nowhere.json"),
+    Command(f"{BATCH} --mask HERE/nowhere.png", words="nowhere.png"),
+    Command(f"{BATCH} --light HERE/nowhere.json", words="nowhere.json"),
+    Command(f"{BATCH} --fusion.voxel -1", words="--fusion.voxel: -1"),
+    Command(f"batch HERE/frame* {OUT} --checkpoint HERE/nowhere", words="nowhere"),
+    Command("batch HERE -o HERE/file", words="file"),
+    Command(f"batch HERE {DECLINE} --jobs 0 -o HERE/others", words="others"),
+    Command(f"batch HERE {DECLINE} --jobs 0 -o {HIDDEN}", words="version"),
     Command(f"{LIVE} --rate 1e-9", words="--rate: 1e-09"),
     Command(f"{LIVE} --rate 0", words="--rate: 0"),
     Command(f"{LIVE} --rate .nan", words="--rate: nan"),

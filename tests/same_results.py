@@ -131,8 +131,8 @@ they make and would differ for that alone; c3vd and predict_self are the same ve
 LEFT_OUT = {"seconds", "started", "command", "versions", "revision", "peak_memory_mb", "arguments", "timings", "inputs"}
 LEFT_OUT |= {"files", "resumed"}
 """Keys of JSON: times, the machine, how the run was asked for, and sizes of files in which those stand."""
-PASSED_OVER = ("config.yaml", "log.txt", "timings.csv", "timings.png", "tensorboard", "model.md")
-"""Settings and times once more, and the card that model.safetensors holds as well."""
+PASSED_OVER = ("config.yaml", "log.txt", "timings.csv", "timings.png", "table.csv", "tensorboard", "model.md")
+"""Settings and times once more, what table.json has without times, and the card that model.safetensors holds."""
 COUNTED = ("sparse",)
 """Sparse maps are the same bytes from run to run. Under a tolerance they are compared by cameras and by
 counts of points, to one in twenty: a last bit decides which points a mapping keeps."""

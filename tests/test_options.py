@@ -27,7 +27,7 @@ from lightdepth.datasets import FORMATS, FormatName
 
 UNIT = re.compile(
     r"\b(mm|millimetres|milliseconds|seconds|pixels|voxels|degrees|radians|megabytes|map units|map unit|turns of the"
-    r"|shares?|numbers?|counts?|weights?|rate|decay|factor|ratios?|exponent|multiple|cosine|log|sigmas?|deviation|days"
+    r"|minutes|gigabytes|shares?|numbers?|counts?|weights?|rate|decay|factor|ratios?|exponent|multiple|cosine|log|sigmas?|deviation|days"
     r"|brightness|contrast|code values?|correlation|norm)\b|\bin \[0, 1\]|\bunits of\b",
     re.IGNORECASE,
 )

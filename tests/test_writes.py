@@ -28,6 +28,7 @@ ALLOWED = {
     "lightdepth/commands/import_frames.py: import_frames": _RUN,
     "lightdepth/commands/predict.py: _written": _RUN,
     "lightdepth/exporting/example.py: main": "an example that is exported, and that users run by themselves",
+    "densify/batch/work.py: batch_run": "write_table uses write_together",
     "lightdepth/reporting/kept.py: kept": _RUN,
     "lightdepth/prediction.py: save": "predict gives it the run's folder",
     "lightdepth/reporting/batches.py: finish": _HIDDEN,

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from shlex import quote
 
 from densify.config import DensifyConfig
-from densify.costs import surface_steps, surfaces_of
-from densify.densified import Densified
-from densify.inputs import MapSource, SurfaceFiles, doubts_of_inputs, fitted_light, map_and_frames
+from densify.dense_run import Asked, dense_run
+from densify.inputs import MapSource, SurfaceFiles
 from densify.joining import MergeConfig
-from densify.page import FILES, densify_page, joined_section
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
 from lightdepth.datasets import SequenceSource
-from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
 
 
@@ -49,39 +45,6 @@ def densify(
             done are not made again.
     """
     model = predicting.load(details=False)  # before minutes are spent on a sparse map
-    arguments = recorded(
-        source,
-        mapped,
-        predicting,
-        config,
-        files,
-        output=output,
-        sfm=sfm,
-        fit_light=fit_light,
-        merge=merge,
-        merging=merging,
-    )
-    with run_folder(output, "densify", arguments, overwrite, resume) as run:
-        run.hash_inputs(**source.files, map=mapped.map, checkpoint=Path(predicting.checkpoint))
-        sparse_map, frames = map_and_frames(run, source, mapped, sfm)
-        doubts = doubts_of_inputs(run, sparse_map, frames)
-        run.begins(surfaces_of(sparse_map, frames), partial(surface_steps, sparse_map, frames, model, fit_light))
-        frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
-        work = Densified.make(frames, sparse_map, model, config, merging if merge else None, run)
-        work.doubts = doubts
-        work.write(run, files.formats, files.mm_per_unit)
-        proposals = {} if mapped.map is None or mapped.repair_map else work.proposals()
-        for map_id, proposal in proposals.items():
-            run.log(f"map {map_id}: {proposal}")
-        run.record["proposals"] = proposals
-        notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
-        notes += [f"Warning: {said}" for said in run.record["warnings"]]
-        notes += [f"Map {map_id}: {proposal}." for map_id, proposal in proposals.items()]
-        page = densify_page(
-            "Densified maps", work.results, work.gallery, notes, None, files.mm_per_unit, merged=work.merged
-        )
-        if work.merged is not None:
-            joined_section(page, work.merged)
-        page.files(run.folder, FILES)
-        page.write(run.folder / "report.html")
+    asked = Asked(source, mapped, predicting, config, sfm, files, fit_light, merge, merging)
+    dense_run(asked, model, output, overwrite, resume)
     end(output, then=f"lightdepth view {quote(str(output))}", page=output / "report.html")

@@ -121,6 +121,13 @@ PAGES = {
         rare=("keep_mb",),
         more=("fusion.voxel",),
     ),
+    "batch": Page(
+        (
+            "lightdepth batch data -o runs/night --map slam --jobs 4",
+            "lightdepth batch procedures.csv -o runs/all --shard 2/8 --merging.by points",
+        ),
+        rare=("keep_mb", "threads", "bit_depth", "trust_map", "recipe", "fov"),
+    ),
     "live": Page(
         (
             "lightdepth live data/mine --map runs/slam -o runs/live",

@@ -32,6 +32,7 @@ ORDER = (
     "predict",
     "sparse",
     "densify",
+    "batch",
     "live",
     "evaluate",
     "bench",

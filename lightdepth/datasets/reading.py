@@ -83,13 +83,18 @@ def stamps_of(path: str | Path, format: str | None = None) -> Stamps:
     return Stamps(load, str(images))
 
 
-def image_files(path: Path, format: str | None = None) -> dict[int, str]:
-    """Names of the frames' files by frame number; none of a video, whose frames have no files."""
+def frames_at(path: Path, format: str | None = None) -> list[Path]:
+    """The frames' files in order; none of a video, whose frames have no files."""
     if not path.is_dir() or (format in (None, "video") and video_at(path) is not None) or _is_cluster(path, format):
-        return {}
+        return []
     data_set = _BY_NAME.get(format) if format is not None else _looks_like(path)
     images = (data_set or folder.FORMAT).images(path)
-    return {frame_number(p.name): p.name for p in list_images(images)} if images.is_dir() else {}
+    return list_images(images) if images.is_dir() else []
+
+
+def image_files(path: Path, format: str | None = None) -> dict[int, str]:
+    """Names of the frames' files by frame number; none of a video."""
+    return {frame_number(p.name): p.name for p in frames_at(path, format)}
 
 
 def _open(
@@ -155,13 +160,13 @@ def _other_format(path: Path, format: str) -> str:
 
 def _folders_below(path: Path) -> str:
     """What to give where a folder holds sequences, and is none."""
-    if _is_sequence(path):
+    if is_sequence(path):
         return ""
     found: list[Path] = []
     level = [path]
     for _ in range(_DEEP):
         below = [p for folder in level for p in folders_in(folder)[:_MANY] if p.name != "truth"]
-        found += [p for p in below if _is_sequence(p)]
+        found += [p for p in below if is_sequence(p)]
         level = [p for p in below if p not in found]
     if not found:
         return ""
@@ -169,7 +174,8 @@ def _folders_below(path: Path) -> str:
     return f". It holds folders of frames: give one of them ({names})"
 
 
-def _is_sequence(path: Path) -> bool:
+def is_sequence(path: Path) -> bool:
+    """Whether a folder has frames as files, of any format."""
     return any(data_set.fits(path) for data_set in _BY_NAME.values())
 
 

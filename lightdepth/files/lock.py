@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lightdepth.errors import InputError
+from lightdepth.errors import InputError, InUse
 from lightdepth.signals import finishing_first
 
 _LOCK = {"host", "pid", "time"}
@@ -31,7 +31,7 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 @contextmanager
 def locked(output: Path) -> Iterator[None]:
-    """Within it no other run writes to `output`. Raises InputError, naming host, process and time, when one does."""
+    """Within it no other run writes to `output`. Raises InUse, naming host, process and time, when one does."""
     path, descriptor = lock_path(output), None
     try:
         with finishing_first():
@@ -119,14 +119,14 @@ def _opened(path: Path, output: Path) -> int:
         except BlockingIOError:
             holder = _read(descriptor)
             os.close(descriptor)
-            raise InputError(
+            raise InUse(
                 output, f"another run writes to it ({_told(holder)})", "wait for its end, or choose another -o"
             ) from None
         except OSError:  # a file system without locks: the process alone tells
             holder = _read(descriptor)
             if holder and _is_ours(holder) and _lives(holder):
                 os.close(descriptor)
-                raise InputError(
+                raise InUse(
                     output, f"another run writes to it ({_told(holder)})", f"wait for its end, or remove {path}"
                 ) from None
         if not _is_at(descriptor, path):  # its holder has just removed it
@@ -138,7 +138,7 @@ def _opened(path: Path, output: Path) -> int:
             raise _in_the_way(path, output)
         if holder and not _is_ours(holder):
             os.close(descriptor)
-            raise InputError(
+            raise InUse(
                 output,
                 f"a run on another machine writes to it ({_told(holder)})",
                 f"wait for its end; if it is dead, remove {path}",

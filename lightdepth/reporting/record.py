@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -73,8 +74,10 @@ def versions() -> dict[str, str]:
     return found
 
 
+@cache
 def git_revision() -> str | None:
-    """Revision of the program's own checkout ("+" with uncommitted changes), or None outside one."""
+    """Revision of the program's own checkout ("+" with uncommitted changes) when it is first asked for, or None outside
+    one: a process that makes many runs works with what it has loaded."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None

@@ -56,16 +56,16 @@ class Report:
             f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
         )
 
-    def files(self, folder: Path, what: Mapping[str, str]) -> None:
-        """Links to the files of a run, which lie beside the page: `what` says what those of a pattern are, in the order
-        in which they are shown; then come those that every run writes last."""
+    def files(self, folder: Path, what: Mapping[str, str], of_a_run: bool = True) -> None:
+        """Links to files that lie beside the page: `what` says what those of a pattern are, in the order in which they
+        are shown; then, of a run, come those that every run writes last."""
         found = [
             (path.relative_to(folder).as_posix(), said)
             for pattern, said in what.items()
             for path in sorted(folder.glob(pattern))
             if path.is_file()
         ]
-        self.links([*found, *_OF_EVERY_RUN])
+        self.links([*found, *(_OF_EVERY_RUN if of_a_run else ())])
 
     def links(self, files: Sequence[tuple[str, str]]) -> None:
         """Links to files by their path from the page, and what each is."""

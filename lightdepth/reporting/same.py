@@ -51,7 +51,7 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
     if (version := begun.get("version", own_version())) != own_version():
         found = f"not resumed, it was begun by version {version}, and this is {own_version()}"
         raise InputError(output, found, "go on with that version, or give --overwrite to start anew")
-    now, then = _one_by_one(compared(arguments)), _one_by_one(compared(begun.get("arguments") or {}))
+    now, then = one_by_one(compared(arguments)), one_by_one(compared(begun.get("arguments") or {}))
     for name in dict.fromkeys([*now, *then]):
         if now.get(name) != then.get(name):
             if isinstance(then.get(name), str) and TOKEN.fullmatch(then[name]):
@@ -67,12 +67,12 @@ def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Map
             raise InputError(output, f"not resumed, {name} has changed since", "--overwrite starts anew")
 
 
-def _one_by_one(arguments: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+def one_by_one(arguments: Mapping[str, Any], above: str = "") -> dict[str, Any]:
     """Each option by its name, those of a group as the command line has them: sift.features."""
     found: dict[str, Any] = {}
     for name, value in arguments.items():
         inner = isinstance(value, Mapping) and bool(value)
-        found |= _one_by_one(value, f"{above}{name}.") if inner else {f"{above}{name}": value}
+        found |= one_by_one(value, f"{above}{name}.") if inner else {f"{above}{name}": value}
     return found
 
 

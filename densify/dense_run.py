@@ -1,0 +1,74 @@
+"""A sequence becomes a run folder of dense surfaces: what the verb densify does, and batch for each of many."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from densify.config import DensifyConfig
+from densify.costs import surface_steps, surfaces_of
+from densify.densified import Densified
+from densify.inputs import MapSource, SurfaceFiles, doubts_of_inputs, fitted_light, map_and_frames
+from densify.joining import MergeConfig
+from densify.page import FILES, densify_page, joined_section
+from lightdepth.checkpoint import ModelSource
+from lightdepth.datasets import SequenceSource
+from lightdepth.models import DepthModel
+from lightdepth.reporting.run import recorded, run_folder
+from lightdepth.sfm.config import SfmConfig
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be made of one sequence: the options of densify."""
+
+    source: SequenceSource
+    mapped: MapSource
+    predicting: ModelSource
+    config: DensifyConfig
+    sfm: SfmConfig
+    files: SurfaceFiles
+    fit_light: bool
+    merge: bool
+    merging: MergeConfig
+
+
+def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = False, resume: bool = False) -> None:
+    """Makes the run folder `output`; `model` is the one that `asked.predicting` names. Raises as `run_folder` does."""
+    source, mapped, config, files = asked.source, asked.mapped, asked.config, asked.files
+    arguments = recorded(
+        source,
+        mapped,
+        asked.predicting,
+        config,
+        files,
+        output=output,
+        sfm=asked.sfm,
+        fit_light=asked.fit_light,
+        merge=asked.merge,
+        merging=asked.merging,
+    )
+    with run_folder(output, "densify", arguments, overwrite, resume) as run:
+        run.hash_inputs(**source.files, map=mapped.map, checkpoint=Path(asked.predicting.checkpoint))
+        sparse_map, frames = map_and_frames(run, source, mapped, asked.sfm)
+        doubts = doubts_of_inputs(run, sparse_map, frames)
+        run.begins(surfaces_of(sparse_map, frames), partial(surface_steps, sparse_map, frames, model, asked.fit_light))
+        frames = fitted_light(run, frames, sparse_map, model, config, asked.fit_light)
+        work = Densified.make(frames, sparse_map, model, config, asked.merging if asked.merge else None, run)
+        work.doubts = doubts
+        work.write(run, files.formats, files.mm_per_unit)
+        proposals = {} if mapped.map is None or mapped.repair_map else work.proposals()
+        for map_id, proposal in proposals.items():
+            run.log(f"map {map_id}: {proposal}")
+        run.record["proposals"] = proposals
+        notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
+        notes += [f"Warning: {said}" for said in run.record["warnings"]]
+        notes += [f"Map {map_id}: {proposal}." for map_id, proposal in proposals.items()]
+        page = densify_page(
+            "Densified maps", work.results, work.gallery, notes, None, files.mm_per_unit, merged=work.merged
+        )
+        if work.merged is not None:
+            joined_section(page, work.merged)
+        page.files(run.folder, FILES)
+        page.write(run.folder / "report.html")
