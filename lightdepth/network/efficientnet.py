@@ -82,14 +82,14 @@ class _Block(nn.Module):
 class EfficientNetLite(nn.Module):
     """Features at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution, with `channels` channels.
 
-    Height and width have to be multiples of 32. 2.9 M parameters.
+    Height and width have to be multiples of 32. 3.0 M parameters.
     """
 
     channels = (16, 24, 40, 112, 320)
     stem = "_conv_stem.weight"
     """The weights that see the image."""
     std = (0.5, 0.5, 0.5)
-    """Of colours less 1/2, by which the published weights expect an image to be divided."""
+    """By which the published weights expect colours less 1/2 to be divided."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()

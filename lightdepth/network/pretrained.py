@@ -21,12 +21,10 @@ from lightdepth.files.weights import check_header, read_pickled
 from lightdepth.network import dpt
 from lightdepth.network.heads import CHANNELS
 from lightdepth.network.model import DepthNetwork
-from lightdepth.network.unet import LITE, UNet
+from lightdepth.network.unet import IMAGENET_STD, LITE, UNet
 
 IMAGENET = "imagenet"
 """In place of a file: the ImageNet weights that are installed with the extra `pretrained`."""
-
-IMAGENET_STD = (0.229, 0.224, 0.225)
 
 _RENAMED = {  # transformers 4 -> 5
     "attention.attention.query": "attention.q_proj",

@@ -17,6 +17,9 @@ DECODER = (16, 32, 64, 128, 256)
 RESNETS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3), "resnet50": (3, 4, 6, 3)}
 """Blocks per stage; resnet50's have a bottleneck."""
 
+IMAGENET_STD = (0.229, 0.224, 0.225)
+"""Of the colours of ImageNet."""
+
 LITE = "efficientnet-lite0"
 ENCODERS = (*RESNETS, LITE)
 
@@ -71,8 +74,8 @@ class ResNet(nn.Module):
 
     stem = "conv1.weight"
     """The weights that see the image."""
-    std = (0.229, 0.224, 0.225)
-    """Of the colours of ImageNet, by which torchvision's weights expect an image to be divided."""
+    std = IMAGENET_STD
+    """By which torchvision's weights expect colours to be divided."""
 
     def __init__(self, encoder: str, inputs: int) -> None:
         super().__init__()
