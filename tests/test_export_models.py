@@ -151,6 +151,7 @@ def json_light(folder: Path) -> dict[str, float]:
         {"inputs": ("rgb", "closed_form", "ray_z", "mask", "reflectance"), "output": "absolute", "uncertainty": True},
         {"norm": "batch", "output": "free"},
         {"kind": "unet"},
+        {"kind": "unet", "encoder": "efficientnet-lite0"},
     ],
 )
 def test_a_graph_takes_images_and_batches_of_any_size(changes, tmp_path):

@@ -12,7 +12,7 @@ from lightdepth.errors import InputError
 from lightdepth.network import NetworkConfig, build_network, load_pretrained
 from lightdepth.network.heads import CHANNELS, UncertaintyHead, network_inputs
 from lightdepth.network.pretrained import IMAGENET_STD
-from lightdepth.network.unet import ENCODERS, ResNet
+from lightdepth.network.unet import RESNETS, ResNet
 from lightdepth.photometry import LightTerms, PhotometricCalibration
 
 DPT = NetworkConfig(kind="dpt", encoder="vitt14")
@@ -23,6 +23,7 @@ CONFIGS = [
     NetworkConfig(output="limited", width=8),
     NetworkConfig(output="free", width=8),
     NetworkConfig(kind="unet", uncertainty=True),
+    NetworkConfig(kind="unet", encoder="efficientnet-lite0", output="limited"),
 ]
 
 
@@ -166,7 +167,7 @@ def test_configuration_survives_json(config):
         ({"inputs": ["rgb", "depth"]}, "closed_form"),
         ({"output": "disparity"}, "residual"),
         ({"colour": 1}, "colour"),
-        ({"kind": "unet", "encoder": "resnet51"}, "resnet18, resnet34, resnet50"),
+        ({"kind": "unet", "encoder": "resnet51"}, "resnet18, resnet34, resnet50, efficientnet-lite0"),
         ({"encoder": "resnet18"}, "none"),
     ],
 )
@@ -228,7 +229,7 @@ def torchvision_like(encoder: str, seed: int = 0) -> dict[str, torch.Tensor]:
     return {**ResNet(encoder, 3).state_dict(), "fc.weight": torch.zeros(1000, 512), "fc.bias": torch.zeros(1000)}
 
 
-@pytest.mark.parametrize(("encoder", "suffix"), [*((e, "safetensors") for e in ENCODERS), ("resnet18", "pth")])
+@pytest.mark.parametrize(("encoder", "suffix"), [*((e, "safetensors") for e in RESNETS), ("resnet18", "pth")])
 def test_imagenet_weights_come_from_a_file_and_see_colours_only(tmp_path, encoder, suffix):
     path, weights = tmp_path / f"w.{suffix}", torchvision_like(encoder)
     save_file(weights, str(path)) if suffix == "safetensors" else torch.save(weights, path)

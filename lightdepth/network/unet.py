@@ -1,7 +1,7 @@
-"""ResNet encoders and a decoder with skip connections, in plain torch.
+"""Convolutional encoders, ResNets among them, and a decoder with skip connections, in plain torch.
 
 The layout is the customary one of self-supervised depth networks (He et al., CVPR 2016; Godard et al., ICCV 2019).
-Parameters of the encoder are named as torchvision names them, so that its ImageNet weights can be read from a file.
+Parameters of a ResNet are named as torchvision names them, so that its ImageNet weights can be read from a file.
 """
 
 from __future__ import annotations
@@ -10,13 +10,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lightdepth.network.efficientnet import EfficientNetLite
+
 DECODER = (16, 32, 64, 128, 256)
 
-ENCODERS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3), "resnet50": (3, 4, 6, 3)}
+RESNETS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3), "resnet50": (3, 4, 6, 3)}
 """Blocks per stage; resnet50's have a bottleneck."""
 
-STEM = "conv1.weight"
-"""The weights that see the image."""
+IMAGENET_STD = (0.229, 0.224, 0.225)
+"""Of the colours of ImageNet."""
+
+LITE = "efficientnet-lite0"
+ENCODERS = (*RESNETS, LITE)
 
 
 def _conv(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> nn.Conv2d:
@@ -67,6 +72,11 @@ class _Bottleneck(nn.Module):
 class ResNet(nn.Module):
     """Features at 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution, with `channels` channels."""
 
+    stem = "conv1.weight"
+    """The weights that see the image."""
+    std = IMAGENET_STD
+    """By which torchvision's weights expect colours to be divided."""
+
     def __init__(self, encoder: str, inputs: int) -> None:
         super().__init__()
         block = _Bottleneck if encoder == "resnet50" else _BasicBlock
@@ -74,7 +84,7 @@ class ResNet(nn.Module):
         self.channels = (64, *(width * block.expansion for width in widths))
         self.conv1, self.bn1 = _conv(inputs, 64, 7, 2), nn.BatchNorm2d(64)
         self.pool = nn.MaxPool2d(3, 2, 1)
-        for stage, (width, below, blocks) in enumerate(zip(widths, self.channels, ENCODERS[encoder], strict=False), 1):
+        for stage, (width, below, blocks) in enumerate(zip(widths, self.channels, RESNETS[encoder], strict=False), 1):
             stride = 1 if stage == 1 else 2
             first = block(below, width, stride)
             rest = [block(width * block.expansion, width, 1) for _ in range(blocks - 1)]
@@ -100,17 +110,17 @@ class _UpConv(nn.Module):
         return F.elu(self.conv(x))
 
 
-class ResNetUNet(nn.Module):
+class UNet(nn.Module):
     """(B, inputs, H, W) -> features (B, channels, H, W) for `head`, H and W multiples of `multiple`.
 
-    14 M parameters with resnet18, 24 M with resnet34, 33 M with resnet50.
+    Parameters: 5 M with efficientnet-lite0, 14 M with resnet18, 24 M with resnet34, 33 M with resnet50.
     """
 
     multiple = 32
 
     def __init__(self, inputs: int, outputs: int, encoder: str = "resnet18") -> None:
         super().__init__()
-        self.encoder = ResNet(encoder, inputs)
+        self.encoder = EfficientNetLite(inputs) if encoder == LITE else ResNet(encoder, inputs)
         below = [*DECODER[1:], self.encoder.channels[-1]]
         skips = [0, *self.encoder.channels[:-1]]
         self.reduce = nn.ModuleList(_UpConv(b, d) for b, d in zip(below, DECODER, strict=True))
