@@ -65,9 +65,9 @@ class MapSource(PairingConfig):
     """Make the map anew before it is used, by matching the images of its keyframes, beginning at its poses and keeping
     its frame and scale; written to sparse/ in the run folder. Switched off, it is used as it is."""
     polish_map: bool = False
-    """Put keyframes where the map's own points see them, before all else, where hidden blocks of points bear it out:
-    for poses that stray from their points. The map is then written to polished/ in the run folder, in its frame and
-    scale. Switched off, poses stay as they are."""
+    """Put keyframes whose poses stray from the map's own points where these see them, each only where hidden blocks of
+    points bear it out, and before repair_map. A map of which some moved is written to polished/ in the run folder, in
+    its frame and scale. Switched off, poses stay as they are."""
 
     @classmethod
     def read_as(cls, map: Path, reading: MapReading, trust_map: bool = False, repair_map: bool = False) -> MapSource:
