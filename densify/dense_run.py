@@ -63,6 +63,7 @@ def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = F
             run.log(f"map {map_id}: {proposal}")
         run.record["proposals"] = proposals
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
+        notes += [f"Poses: {told['sentence']}." for told in run.record.get("polish", ())]
         notes += [f"Warning: {said}" for said in run.record["warnings"]]
         notes += [f"Map {map_id}: {proposal}." for map_id, proposal in proposals.items()]
         page = densify_page(

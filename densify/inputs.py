@@ -24,6 +24,7 @@ from lightdepth.errors import InputError
 from lightdepth.frame import Frame, check_image_size
 from lightdepth.light.fit_on_map import fit_assumed_light
 from lightdepth.light.views import with_light
+from lightdepth.maps import write_text_model
 from lightdepth.maps.convention import MapReading
 from lightdepth.models import ConstantModel, DepthModel
 from lightdepth.ranges import above, checked
@@ -33,6 +34,7 @@ from lightdepth.reporting.run import Run, plain
 from lightdepth.sfm.config import Progress, SfmConfig
 from lightdepth.sfm.keeping import KeptDatabase
 from lightdepth.sfm.made import made_sparse
+from lightdepth.sfm.polish import polished_submap
 from lightdepth.sfm.repair import Repair, repaired_submap
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap, with_provenance
 from lightdepth.uncalibrated import check_camera_asked, open_frames
@@ -64,6 +66,10 @@ class MapSource(PairingConfig):
     repair_map: bool = False
     """Make the map anew before it is used, by matching the images of its keyframes, beginning at its poses and keeping
     its frame and scale; written to sparse/ in the run folder. Switched off, it is used as it is."""
+    polish_map: bool = False
+    """Put keyframes whose poses stray from the map's own points where these see them, each only where hidden blocks of
+    points bear it out, and before repair_map. A map of which some moved is written to polished/ in the run folder, in
+    its frame and scale. Switched off, poses stay as they are."""
 
     @classmethod
     def read_as(cls, map: Path, reading: MapReading, trust_map: bool = False, repair_map: bool = False) -> MapSource:
@@ -87,6 +93,8 @@ def map_and_frames(
     """The map that was given, or one made of the frames, and the frames, under the map's camera where they have none.
     A map made at another image size is rescaled to theirs. Raises InputError where no frame is of the map, or where
     the images say that they are not its."""
+    if mapped.map is None and mapped.polish_map:
+        raise InputError("--polish-map", "given without --map: pycolmap's own poses fit its points", "leave it out")
     if mapped.map is None:
         frames = open_frames(source, run, None, sfm).without_truth()
         return made_sparse(run, frames, sfm, files=source.image_files), frames
@@ -103,6 +111,8 @@ def map_and_frames(
         run.log(f"map made at {map_camera.width}x{map_camera.height}, rescaled to the frames' {width}x{height}")
     fitted = fitted_to_frames(sparse_map, width, height, given)  # first: a cropped image is refused by its size
     check_pairing(sparse_map, frames, mapped, run, given)
+    if mapped.polish_map:
+        fitted = polished(run, fitted)
     return (repaired(run, fitted, frames, sfm) if mapped.repair_map else fitted), frames
 
 
@@ -123,6 +133,21 @@ def _say_localised(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> No
             )
     if told:
         run.record["localised"] = plain(told)
+
+
+def polished(run: Run, sparse_map: SparseMap) -> SparseMap:
+    """The map with the poses that its points bear out; submaps of which one moved are written to polished/ in the run
+    folder, as COLMAP models."""
+    submaps, told = [], []
+    for submap in sparse_map.submaps:
+        new, polish = polished_submap(submap)
+        if not polish.left:
+            write_text_model(new, run.folder / "polished" / str(submap.id))
+        run.log(f"poses: {polish}")
+        submaps.append(new)
+        told.append({**plain(polish), "sentence": str(polish)})
+    run.record["polish"] = told
+    return replace(sparse_map, submaps=tuple(submaps))
 
 
 def repaired(run: Run, sparse_map: SparseMap, frames: FrameSequence, config: SfmConfig) -> SparseMap:

@@ -194,6 +194,7 @@ MORE = [
     Command(f"sparse {DATA} {OUT} --poses HERE/nowhere.tum", words="nowhere.tum"),
     Command(f"sparse {DATA} {OUT} --poses truth --repair HERE/colmap", words="--repair"),
     Command(f"sparse {DATA} {OUT} --repair HERE/nowhere", words="nowhere"),
+    Command(f"densify {DATA} {DECLINE} {OUT} --polish-map true", words="--polish-map: given without --map"),
     Command(f"sparse {DATA} {OUT} --sfm.num-threads 0", words="--sfm.num-threads: 0"),
     Command(f"sparse {DATA} {OUT} --sfm.peak-threshold .nan", words="--sfm.peak-threshold: nan"),
     Command(f"sparse HERE/blackness {OUT}", words="are they black"),

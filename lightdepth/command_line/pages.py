@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 _ALWAYS_RARE = (
-    *("print_config", "map_sensor", "time_tolerance", "map_folder", "frame_offset", "keep_names"),
+    *("print_config", "map_sensor", "time_tolerance", "map_folder", "frame_offset", "keep_names", "polish_map"),
     "device",
 )
 
