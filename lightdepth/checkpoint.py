@@ -29,7 +29,7 @@ from lightdepth.models import ConstantModel, DeclineModel, DepthModel, NetworkMo
 from lightdepth.network import DepthNetwork, NetworkConfig, build_network
 from lightdepth.reporting.names import told
 
-DEFAULT_CHECKPOINT = "lightdepth-synthetic"
+DEFAULT_CHECKPOINT = "lightdepth-both"
 Device = Literal["auto", "cpu", "cuda", "mps"]
 """Where a network runs; auto: on a CUDA GPU where there is one, else on the processor."""
 TRAINING_FREE: dict[str, type[DeclineModel] | type[ConstantModel]] = {
@@ -75,9 +75,9 @@ class ModelSource:
     """Which depth model predicts, and what it runs on."""
 
     checkpoint: str = DEFAULT_CHECKPOINT
-    """Depth model: path of a checkpoint (.safetensors or .ckpt), name of a bundled one (lightdepth-synthetic or
-    lightdepth-self), decline (a formula from how light fades, no network) or constant (all equally far, to compare
-    with)."""
+    """Depth model: path of a checkpoint (.safetensors or .ckpt), name of a bundled one (lightdepth-both,
+    lightdepth-self or lightdepth-synthetic), decline (a formula from how light fades, no network) or constant (all
+    equally far, to compare with)."""
     device: Device = "auto"
     """What the network runs on: auto, a CUDA GPU where there is one, else the processor; cpu, the processor; cuda; or
     mps, the GPU of an Apple computer."""

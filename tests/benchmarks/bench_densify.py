@@ -38,7 +38,7 @@ from lightdepth.tube.slam import SimulatedSlam, SlamConfig, simulate_slam
 
 SCENES = [int(seed) for seed in os.environ.get("LIGHTDEPTH_SCENES", "400 401 402 403 404 405").split()]
 SLAM_SEEDS = (0, 1, 2)
-CHECKPOINTS = ("lightdepth-self", "lightdepth-synthetic")
+CHECKPOINTS = ("lightdepth-self", "lightdepth-both")
 LENSES = ("c3vd", "fisheye", "pinhole")
 FULL, PAPER = DensifyConfig(), DensifyConfig(recipe="paper")
 DROPPED = {
