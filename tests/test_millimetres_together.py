@@ -26,13 +26,14 @@ def resized(given: list[Look], factor: float) -> list[Look]:
 
 
 def test_maps_of_one_procedure_have_scales_of_their_own_and_one_reflectance(looks):  # noqa: F811
-    found = together([looks, resized(looks, 4.0), looks[:2]], LIGHT, [2.3, 0.6, 2.0])
+    found = together([looks, resized(looks, 4.0), looks[:2]], LIGHT, [2.3, 0.6, 2.0], surface=0.12)
     first, second, third = found.maps
     assert first.mm_per_unit == pytest.approx(2.0, rel=0.1) and second.mm_per_unit == pytest.approx(0.5, rel=0.15)
     assert first.reflectance == second.reflectance and not first.refused and not second.refused
     assert third.refused == "2 keyframes see the surface, of 3 needed" and np.isnan(third.mm_per_unit)
     assert found.covariance.shape == (3, 3) and np.isinf(found.covariance[2, 2])
-    assert np.sqrt(found.covariance[0, 0]) == first.deviation
+    assert np.sqrt(found.covariance[0, 0]) == first.deviation > 0.12  # that of its surface is in it
+    assert found.covariance[0, 1] < found.covariance[0, 0] - 0.12**2  # and is its own
     # What both share of their errors, the reflectance and the lens's part, is in the covariance.
     assert found.covariance[0, 1] == found.covariance[1, 0] != 0
 

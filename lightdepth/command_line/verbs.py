@@ -34,6 +34,7 @@ ORDER = (
     "live",
     "evaluate",
     "bench",
+    "scale",
     "measure",
     "view",
     "export",

@@ -120,10 +120,15 @@ def millimetres(looks: Sequence[Look], light: PhotometricCalibration, near: floa
 
 
 def together(
-    maps: Sequence[Sequence[Look]], light: PhotometricCalibration, near: Sequence[float], seed: int = 0
+    maps: Sequence[Sequence[Look]],
+    light: PhotometricCalibration,
+    near: Sequence[float],
+    seed: int = 0,
+    surface: float = 0.0,
 ) -> Together:
     """The scales of maps, given by their looks, that share the light, the wall's reflectance and the share of unseen
-    wall. Each scale is looked for from .4 to 2.5 times that in `near`, mm per map unit."""
+    wall. Each scale is looked for from .4 to 2.5 times that in `near`, mm per map unit. `surface` is the deviation of
+    its logarithm by what is wrong with the looks' distances; it is each map's own."""
     covariance = np.diag(np.full(len(maps), np.inf))
     offset = float(np.hypot(*light.position_mm[:2]))
     if light.assumed or offset == 0:
@@ -134,7 +139,7 @@ def together(
     rows = [i for i, one in enumerate(found) if isinstance(one, _Placed)]
     placed = [one for one in found if isinstance(one, _Placed)]
     if placed:
-        told, covariance[np.ix_(rows, rows)] = _solved(placed, offset, [near[i] for i in rows], rng)
+        told, covariance[np.ix_(rows, rows)] = _solved(placed, offset, [near[i] for i in rows], rng, surface)
         found = [told[rows.index(i)] if i in rows else one for i, one in enumerate(found)]
     return Together(tuple(one for one in found if isinstance(one, Millimetres)), covariance)
 
@@ -175,7 +180,7 @@ def _place(looks: Sequence[Look], light: PhotometricCalibration, rng: np.random.
 
 
 def _solved(
-    placed: Sequence[_Placed], offset: float, near: Sequence[float], rng: np.random.Generator
+    placed: Sequence[_Placed], offset: float, near: Sequence[float], rng: np.random.Generator, surface: float
 ) -> tuple[list[Millimetres], np.ndarray]:
     """What the light tells of each map, and the covariance (k, k) of the logarithms of their scales."""
     ranges = [one * np.geomspace(*_RANGE, _STEPS) for one in near]
@@ -196,7 +201,7 @@ def _solved(
     reflectance, unseen = _FINE[0][row], _FINE[1][column]
     lens = np.array([p.by_the_lens(s, reflectance, unseen) for p, s in zip(placed, scales, strict=True)])
     covariance = _INFLATED**2 * np.atleast_2d(np.cov(draws, rowvar=False, bias=True))
-    covariance += _MODEL**2 * np.eye(len(placed)) + np.outer(lens, lens)
+    covariance += (_MODEL**2 + surface**2) * np.eye(len(placed)) + np.outer(lens, lens)
     told = []
     for k, p in enumerate(placed):
         doubts = p.shading.doubts(float(found[k]), reflectance, unseen)
