@@ -66,7 +66,9 @@ def densify(
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         work = Densified.make(frames, sparse_map, model, config, merging if merge else None, run)
         work.doubts = doubts
-        work.write(run, files.formats, files.mm_per_unit)
+        told = files.mm_per_unit
+        mm_per_unit = work.ask_light(run, frames, files.wall_mm) if told == "light" else told
+        work.write(run, files.formats, mm_per_unit)
         proposals = {} if mapped.map is None or mapped.repair_map else work.proposals()
         for map_id, proposal in proposals.items():
             run.log(f"map {map_id}: {proposal}")
@@ -74,9 +76,7 @@ def densify(
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
         notes += [f"Warning: {said}" for said in run.record["warnings"]]
         notes += [f"Map {map_id}: {proposal}." for map_id, proposal in proposals.items()]
-        page = densify_page(
-            "Densified maps", work.results, work.gallery, notes, None, files.mm_per_unit, merged=work.merged
-        )
+        page = densify_page("Densified maps", work.results, work.gallery, notes, None, mm_per_unit, merged=work.merged)
         if work.merged is not None:
             joined_section(page, work.merged)
         page.files(run.folder, FILES)
