@@ -26,6 +26,7 @@ from lightdepth.depth_gate import sentence
 from lightdepth.errors import InputError
 from lightdepth.hidden_uncertainty import FILE
 from lightdepth.models import DepthModel
+from lightdepth.photometry import PhotometricCalibration
 from lightdepth.reporting.kept import kept
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, plain
@@ -81,11 +82,12 @@ class Densified:
                 merged = join() if run is None else kept(run, "joined", Merged, join)
         return cls(model.name, results, gallery, merged, config=config)
 
-    def ask_light(self, run: Run, frames: FrameSequence, wall_mm: float) -> Mapping[int, float] | None:
+    def ask_light(
+        self, run: Run, frames: FrameSequence, light: PhotometricCalibration, wall_mm: float
+    ) -> Mapping[int, float] | None:
         """Millimetres per unit of each map, as the light beside the lens tells; None where it tells not all, so that
         all stay in map units. Both are said, and in scale.json."""
         maps = [SeenMap.of(r.dense) for r in self.results if len(r.dense.triangles)]
-        light = frames.first().light
         self.scales = found = scales_of(maps, frames, light, wall_mm)
         for one in found.maps:
             (run.log if one.mm_per_unit is not None else run.warn)(str(one))

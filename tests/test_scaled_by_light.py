@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from test_scale import dense_map, frames
+from test_scale import LIGHT, dense_map, frames
 
 from densify import densified
 from densify.densified import Densified
@@ -29,7 +29,7 @@ def densified_in(folder: Path, scales: Scales, monkeypatch) -> tuple[Densified, 
     maps = SparseMap(tuple(r.dense.submap for r in results), "maps")
     work = Densified("truth", results, Gallery(maps))
     with run_folder(folder, "densify", {}) as run:
-        work.write(run, ("ply",), work.ask_light(run, frames(4), 30.0))
+        work.write(run, ("ply",), work.ask_light(run, frames(4), LIGHT, 30.0))
     return work, json.loads((folder / "run.json").read_text())
 
 

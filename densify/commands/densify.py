@@ -10,6 +10,8 @@ from densify.densified import Densified
 from densify.inputs import MapSource, SurfaceFiles, doubts_of_inputs, fitted_light, map_and_frames
 from densify.joining import MergeConfig
 from densify.page import FILES, densify_page, joined_section
+from densify.scale_file import MmPerUnit
+from lightdepth.calibration import read_light
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
@@ -67,7 +69,13 @@ def densify(
         work = Densified.make(frames, sparse_map, model, config, merging if merge else None, run)
         work.doubts = doubts
         told = files.mm_per_unit
-        mm_per_unit = work.ask_light(run, frames, files.wall_mm) if told == "light" else told
+        mm_per_unit: MmPerUnit
+        if told == "light":
+            # As the file has it: a light that was given by hand counts as given, also where its file says assumed.
+            light = frames.first().light if source.light is None else read_light(source.light)
+            mm_per_unit = work.ask_light(run, frames, light, files.wall_mm)
+        else:
+            mm_per_unit = told
         work.write(run, files.formats, mm_per_unit)
         proposals = {} if mapped.map is None or mapped.repair_map else work.proposals()
         for map_id, proposal in proposals.items():
