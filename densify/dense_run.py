@@ -12,6 +12,8 @@ from densify.densified import Densified
 from densify.inputs import MapSource, SurfaceFiles, doubts_of_inputs, fitted_light, map_and_frames
 from densify.joining import MergeConfig
 from densify.page import FILES, densify_page, joined_section
+from densify.scale_file import MmPerUnit
+from lightdepth.calibration import read_light
 from lightdepth.checkpoint import ModelSource
 from lightdepth.datasets import SequenceSource
 from lightdepth.models import DepthModel
@@ -57,7 +59,15 @@ def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = F
         frames = fitted_light(run, frames, sparse_map, model, config, asked.fit_light)
         work = Densified.make(frames, sparse_map, model, config, asked.merging if asked.merge else None, run)
         work.doubts = doubts
-        work.write(run, files.formats, files.mm_per_unit)
+        told = files.mm_per_unit
+        mm_per_unit: MmPerUnit
+        if told == "light":
+            # As the file has it: a light that was given by hand counts as given, also where its file says assumed.
+            light = frames.first().light if source.light is None else read_light(source.light)
+            mm_per_unit = work.ask_light(run, frames, light, files.wall_mm)
+        else:
+            mm_per_unit = told
+        work.write(run, files.formats, mm_per_unit)
         proposals = {} if mapped.map is None or mapped.repair_map else work.proposals()
         for map_id, proposal in proposals.items():
             run.log(f"map {map_id}: {proposal}")
@@ -66,9 +76,7 @@ def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = F
         notes += [f"Poses: {told['sentence']}." for told in run.record.get("polish", ())]
         notes += [f"Warning: {said}" for said in run.record["warnings"]]
         notes += [f"Map {map_id}: {proposal}." for map_id, proposal in proposals.items()]
-        page = densify_page(
-            "Densified maps", work.results, work.gallery, notes, None, files.mm_per_unit, merged=work.merged
-        )
+        page = densify_page("Densified maps", work.results, work.gallery, notes, None, mm_per_unit, merged=work.merged)
         if work.merged is not None:
             joined_section(page, work.merged)
         page.files(run.folder, FILES)

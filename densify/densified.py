@@ -18,12 +18,15 @@ from densify.page import Gallery
 from densify.pipeline import SubmapResult, densify_or_empty
 from densify.predictions import SeenKeyframe
 from densify.resuming import kept_result
+from densify.scale_file import MmPerUnit, Scales, factor
+from densify.scaling import SeenMap, scales_of
 from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence
 from lightdepth.depth_gate import sentence
 from lightdepth.errors import InputError
 from lightdepth.hidden_uncertainty import FILE
 from lightdepth.models import DepthModel
+from lightdepth.photometry import PhotometricCalibration
 from lightdepth.reporting.kept import kept
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import Run, plain
@@ -42,6 +45,8 @@ class Densified:
     """sentences on what the surfaces were made of, with which no verdict is green"""
     config: DensifyConfig = field(default_factory=DensifyConfig)
     """the settings that the surfaces were made with"""
+    scales: Scales | None = None
+    """what the light told of the maps' units; None where it was not asked"""
 
     @classmethod
     def make(
@@ -77,16 +82,42 @@ class Densified:
                 merged = join() if run is None else kept(run, "joined", Merged, join)
         return cls(model.name, results, gallery, merged, config=config)
 
+    def ask_light(
+        self, run: Run, frames: FrameSequence, light: PhotometricCalibration, wall_mm: float
+    ) -> Mapping[int, float] | None:
+        """Millimetres per unit of each map, as the light beside the lens tells; None where it tells not all, so that
+        all stay in map units. Both are said, and in scale.json."""
+        maps = [SeenMap.of(r.dense) for r in self.results if len(r.dense.triangles)]
+        self.scales = found = scales_of(maps, frames, light, wall_mm)
+        for one in found.maps:
+            (run.log if one.mm_per_unit is not None else run.warn)(str(one))
+        if found.told and not found.all_told:
+            run.log("surfaces stay in map units: not every map has a figure")
+        found.write_file(run.folder, "mm" if found.all_told else "map units", light)
+        return found.told if found.all_told else None
+
+    @property
+    def of_millimetres(self) -> str:
+        """What the verdict says of millimetres that the light told; empty where there are none."""
+        if self.scales is None or not self.scales.all_told:
+            return ""
+        reach = max(one.reach for one in self.scales.maps) - 1
+        return f"the colour says nothing of the millimetres, which are the light's: nine of ten are within {reach:.0%}"
+
     @property
     def verdict(self) -> Verdict | None:
         """On all of them: the worst; None where nothing was judged."""
         found = worst([r.verdict for r in self.results if r.verdict is not None])
-        return None if found is None else doubted(found, self.doubts)
+        if found is None:
+            return None
+        found = doubted(found, self.doubts)
+        return replace(found, sentence="; ".join(filter(None, [found.sentence, self.of_millimetres])))
 
     @property
     def headline(self) -> str:
         """The verdict in words; empty where nothing was judged."""
-        return headline({r.dense.submap.id: r.verdict for r in self.results if r.verdict is not None}, self.doubts)
+        found = headline({r.dense.submap.id: r.verdict for r in self.results if r.verdict is not None}, self.doubts)
+        return "; ".join(filter(None, [found, self.of_millimetres])) if found else ""
 
     @cached_property
     def uncertainty(self) -> DoubtsCalibrated | None:
@@ -123,6 +154,7 @@ class Densified:
         notes = [f"Verdict: {self.headline}."] if self.headline else []
         notes += [f"{of}; depth by {self.model}; light of the frames: {under}."]
         notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
+        notes += [f"Millimetres, {one}." for one in (self.scales.maps if self.scales is not None else ())]
         notes.append(f"Uncertainty: {self.of_uncertainty}.")
         notes += [f"Light: {self.doubted}."] if self.doubted else []
         told = [(r.dense.submap.id, r.dense.unsure_share) for r in self.results]
@@ -138,7 +170,7 @@ class Densified:
             )
         return notes
 
-    def write(self, run: Run, formats: tuple[str, ...], mm_per_unit: float | None) -> None:
+    def write(self, run: Run, formats: tuple[str, ...], mm_per_unit: MmPerUnit) -> None:
         """Every surface's folder, its figures in run.json and a line for the user. Raises InputError when none was
         made."""
         made = [r for r in self.results if len(r.dense.triangles)]
@@ -157,6 +189,7 @@ class Densified:
         records = []
         for result in self.results:
             dense, judgement = result.dense, result.judgement
+            scale = factor(mm_per_unit, dense.submap.id)
             name = f"map_{dense.submap.id:03d}"
             records.append(
                 {
@@ -165,10 +198,10 @@ class Densified:
                     "aligned": len(dense.aligned),
                     "vertices": len(dense.vertices),
                     "voxel": dense.voxel,
-                    "origin": [value * (mm_per_unit or 1.0) for value in dense.submap.origin],
+                    "origin": [value * scale for value in dense.submap.origin],
                     "seen_share": result.seen_share,
                     "unsure_share": dense.unsure_share,
-                    "coverage": result.coverage and result.coverage.scaled(mm_per_unit or 1.0).record(),
+                    "coverage": result.coverage and result.coverage.scaled(scale).record(),
                     "verdict": result.verdict and plain(result.verdict),
                     "judge": judgement and judgement.record(),
                     "doubted": result.doubts,
@@ -180,7 +213,7 @@ class Densified:
             if not len(dense.triangles):
                 run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
                 continue
-            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, mm_per_unit)
+            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, scale)
             text = f"{name}: {len(dense.aligned)} of {len(dense.alignments)} keyframes aligned, "
             text += f"{len(dense.vertices)} vertices"
             if judgement is not None:
@@ -224,14 +257,15 @@ class Densified:
                 f"{first.reason})",
             )
 
-    def _write_joined(self, run: Run, merged: Merged, formats: tuple[str, ...], mm_per_unit: float | None) -> None:
-        run.record["merge"] = plain(merged.record(mm_per_unit or 1.0))
+    def _write_joined(self, run: Run, merged: Merged, formats: tuple[str, ...], mm_per_unit: MmPerUnit) -> None:
+        run.record["merge"] = plain(merged.record(partial(factor, mm_per_unit)))
         for result, group in zip(merged.results, merged.groups, strict=True):
             dense, name = result.dense, joined_name(result)
             if not len(dense.triangles):
                 run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
                 continue
-            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, mm_per_unit)
+            scale = factor(mm_per_unit, next(iter(group)))
+            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, scale)
             maps = ", ".join(map(str, sorted(group)))
             text = f"{name}: maps {maps} in one, in the unit of map {next(iter(group))}, "
             run.log(f"{text}{len(dense.aligned)} of {len(dense.alignments)} keyframes aligned")

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from densify.config import MethodConfig
 from densify.placing import Placing
+from densify.scaling import WALL_MM
 from lightdepth.calibration import write_camera
 from lightdepth.camera import CameraModel, Provenance
 from lightdepth.command_line.dry import Step
@@ -47,9 +48,14 @@ class SurfaceFiles:
 
     formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply",)
     """Formats of the mesh files to write: ply, which must be among them, and besides it glb and obj if wanted."""
-    mm_per_unit: Annotated[float | None, above(0)] = None
+    mm_per_unit: Annotated[float | Literal["light"] | None, above(0)] = None
     """Millimetres per map unit, where known: lengths and surfaces are then written in mm, else in map units. It is one
-    factor for all submaps, right for those that share a unit. A larger one makes a larger surface."""
+    factor for all submaps, right for those that share a unit. A larger one makes a larger surface. The word light asks
+    the light beside the lens for each submap's own, with an interval; where it tells none, surfaces stay in map
+    units."""
+    wall_mm: Annotated[float, above(0)] = WALL_MM
+    """Distance of the wall, mm, in the median, for --mm-per-unit light: scales are looked for that make it .4 to 2.5
+    times this. A larger one looks for larger scales."""
 
     def __post_init__(self) -> None:
         if "ply" not in self.formats:

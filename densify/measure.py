@@ -280,33 +280,52 @@ class Measured:
     least_views: int | None = None
     """least number of keyframes that saw a vertex there, where the surface has it"""
 
-    def record(self) -> dict[str, object]:
-        """For a file."""
+    def record(self, reach: float | None = None) -> dict[str, object]:
+        """For a file; with intervals, where nine of ten scales are off by a factor of `reach` at most."""
         record: dict[str, object] = {"places": self.places.tolist()}
         if isinstance(self.found, Way):
             way = self.found
             record |= {"length": way.length, "straight": way.straight, "over_holes": way.over_holes}
         else:
             record |= {"area": self.found.area, "outline": self.found.outline}
+        if reach is not None:
+            record["intervals"] = {
+                name: None if value is None else [value / reach**power, value * reach**power]
+                for name, value, power in self._figures
+            }
         if self.least_views is not None:
             record |= {"least_confidence": self.least_confidence, "least_views": self.least_views}
         return record
 
-    def summary(self, unit: str) -> str:
-        """What was measured, for people."""
+    @property
+    def _figures(self) -> list[tuple[str, float | None, int]]:
+        """Names and values, with the power of the scale that each goes with."""
+        if isinstance(self.found, Way):
+            return [("length", self.found.length, 1), ("straight", self.found.straight, 1)]
+        return [("area", self.found.area, 2), ("outline", self.found.outline, 1)]
+
+    def summary(self, unit: str, reach: float | None = None) -> str:
+        """What was measured, for people; `reach` as in `record`."""
+
+        def told(value: float, power: int = 1) -> str:
+            text = f"{number(value)} {unit}{'²' if power == 2 else ''}"
+            if reach is None:
+                return text
+            return f"{text} ({number(value / reach**power)} to {number(value * reach**power)})"
+
         if isinstance(self.found, Way):
             way = self.found
-            text = f"along the surface {number(way.length)} {unit}, straight {number(way.straight)} {unit}"
+            text = f"along the surface {told(way.length)}, straight {told(way.straight)}"
             if way.over_holes > 0:
                 text += f"; {number(way.over_holes)} {unit} of it over holes"
         else:
-            text = f"area {number(self.found.area)} {unit}²"
+            text = f"area {told(self.found.area, 2)}"
             if self.found.outline is not None:
-                text += f", outline {number(self.found.outline)} {unit}"
+                text += f", outline {told(self.found.outline)}"
         if self.least_views is not None:
             text += f"; seen by {self.least_views} keyframes or more, confidence {self.least_confidence:.2f} or more"
         if unit != "mm":
-            text += ". A map has no size of its own: --mm-per-unit gives it one"
+            text += ". A map has no size of its own: --mm-per-unit gives it one, or `lightdepth scale`"
         return text
 
 

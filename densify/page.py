@@ -14,6 +14,7 @@ from densify.joining import Merged, joined_name
 from densify.judging.verdict import spoke
 from densify.pipeline import SubmapResult
 from densify.predictions import SeenKeyframe
+from densify.scale_file import MmPerUnit, factor
 from densify.scene import KINDS, SURFACE_FILES, TRUSTED, Thumbnails, scene_of, seen_kinds, surface_of, tangents
 from lightdepth.camera import CameraModel
 from lightdepth.reporting.figures import (
@@ -74,7 +75,7 @@ def densify_page(
     gallery: Gallery,
     notes: Sequence[str],
     figures: Sequence[MapFigures] | None = None,
-    mm_per_unit: float | None = None,
+    mm_per_unit: MmPerUnit = None,
     merged: Merged | None = None,
     errors: Sequence[ErrorMesh] = (),
 ) -> Report:
@@ -157,6 +158,7 @@ FILES = {
     "metrics.md": "errors against the truth, in tables",
     "metrics.json": "the same, for programs",
     "cumulative_error.png": "the share of the surface within each error",
+    "scale.json": "millimetres per unit of each map, with an interval, or why none",
     "uncertainty.json": "the factor that calibrates the predicted uncertainty",
 }
 """What the files of a run are, by pattern."""
@@ -187,7 +189,7 @@ def _errors(page: Report, figures: Sequence[MapFigures]) -> None:
     page.table(["", "model", "points", "RMS", "median"], rows)
 
 
-def _coverage(page: Report, results: Sequence[SubmapResult], mm_per_unit: float | None) -> None:
+def _coverage(page: Report, results: Sequence[SubmapResult], mm_per_unit: MmPerUnit) -> None:
     page.heading("Coverage")
     page.text(
         "Which part of the wall was seen well: by enough keyframes, not too slanted, neither clipped nor in the dark, "
@@ -200,7 +202,8 @@ def _coverage(page: Report, results: Sequence[SubmapResult], mm_per_unit: float 
     for result in results:
         if result.coverage is None:
             continue
-        name, c = f"map {result.dense.submap.id}", result.coverage.scaled(mm_per_unit or 1.0)
+        map_id = result.dense.submap.id
+        name, c = f"map {map_id}", result.coverage.scaled(factor(mm_per_unit, map_id))
         rows.append(
             [name, c.area, 100 * c.well_share, len(c.weak), sum(r.area for r in c.weak), len(c.holes), c.hole_area]
         )

@@ -95,6 +95,15 @@ VERBS = (
         resumes=True,
     ),
     Verb(
+        "scale",
+        (
+            *("scale", "dense", "-o", "out", "--length.map", "0", "--length.mm", "5"),
+            *("--length.ends", "[[0, 0, 1], [0, 0, 2]]", "--light", "gamma=2.2,mu=0"),
+        ),
+        "out",
+        ("--length.mm", "6"),
+    ),
+    Verb(
         "measure",
         (
             "measure",

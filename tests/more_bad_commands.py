@@ -15,6 +15,7 @@ CONVERT = f"convert-camera HERE/camera/camera.json {OUT}"
 EVALUATE = f"evaluate HERE/predictions --truth {DATA} {OUT}"
 MEASURE = "measure HERE/dense"
 VIEW = "view HERE/dense"
+SCALE = f"scale HERE/dense {OUT}"
 
 MORE = [
     # ---- numbers out of range
@@ -49,6 +50,8 @@ MORE = [
     Command(f"{SYNTH} --light gama=2", words="is gamma meant?"),
     Command(f"{DENSIFY} --mm-per-unit .inf", words="--mm-per-unit: inf"),
     Command(f"{DENSIFY} --mm-per-unit 0", words="--mm-per-unit: 0"),
+    Command(f"{DENSIFY} --mm-per-unit lamp", 2, "light"),
+    Command(f"{DENSIFY} --mm-per-unit light --wall-mm 0", words="--wall-mm: 0"),
     Command(f"{DENSIFY} --fusion.voxel -1", words="--fusion.voxel: -1"),
     Command(f"{DENSIFY} --fusion.voxel .nan", words="--fusion.voxel: nan"),
     Command(f"{DENSIFY} --fusion.voxels-per-distance 1e9", words="--fusion.voxels-per-distance"),
@@ -247,6 +250,18 @@ MORE = [
     Command(f"{MEASURE} --frame 99 --pixels [[3,4],[5,6]]", words="99"),
     Command(f"{MEASURE} --map 7 --points [[0,0,30],[1,1,30]]", words="7"),
     Command(f"{MEASURE}", words="--points"),
+    Command("scale HERE/nowhere", words="nowhere"),
+    Command("scale HERE/predictions", words="predictions"),
+    Command("scale HERE/dense/map_000", words="the folder of one map"),
+    Command(f"{SCALE} --light HERE/nowhere.json", words="nowhere.json"),
+    Command(f"{SCALE} --light gama=2", words="is gamma meant?"),
+    Command(f"{SCALE} --data HERE/nowhere", words="nowhere"),
+    Command(f"{SCALE} --wall-mm -1", words="--wall-mm: -1"),
+    Command(f"{SCALE} --length.mm 5", words="--length.ends"),
+    Command(f"{SCALE} --length.mm .nan --length.ends [[0,0,1],[0,0,2]]", words="--length.mm: nan"),
+    Command(f"{SCALE} --length.mm 5 --length.ends [[0,0,1],[0,0,1]]", words="0 map units"),
+    Command(f"{SCALE} --length.mm 5 --length.ends [[0,0,1],[0,0,2]] --length.map 9", words="no map 9"),
+    Command("scale HERE/dense -o HERE/others", words="others"),
     Command("measure HERE/nowhere --points [[0,0,30],[1,1,30]]", words="nowhere"),
     Command("measure HERE/predictions --points [[0,0,30],[1,1,30]]", words="predictions"),
     Command("view HERE/nowhere", words="nowhere: no such folder"),

@@ -70,6 +70,7 @@ def test_help_lists_the_verbs_in_the_order_of_the_work_each_with_its_line(capsys
         "live",
         "evaluate",
         "bench",
+        "scale",
         "measure",
         "view",
         "export",
@@ -240,6 +241,22 @@ def test_a_map_s_known_scale_gives_millimetres_and_other_formats_on_request(run,
     assert {"mesh.ply", "mesh.glb", "mesh.obj"} <= set(left_in(tmp_path / "mm" / "map_000"))
     record = json.loads((tmp_path / "mm" / "run.json").read_text())
     assert record["unit"] == "mm" and record["maps"][0]["judge"] is None
+
+
+def test_where_the_light_tells_no_millimetres_surfaces_stay_in_map_units_and_why_is_said(data, tmp_path, capsys):
+    """Its position is another endoscope's: a file that says so is not believed because somebody gave it."""
+    light = json.loads((data / "light.json").read_text()) | {"source": "assumed", "position_mm": [3.0, 1.0, 0.0]}
+    (tmp_path / "light.json").write_text(json.dumps(light))
+    argv = ["--map", data / "slam", "--checkpoint", "decline", "--mm-per-unit", "light", "--no-merge"]
+    argv += ["--light", tmp_path / "light.json", "--judge.on", "false", "-o", tmp_path / "dense"]
+    assert lightdepth("densify", data, *argv) == 0
+    said = capsys.readouterr().out
+    assert "warning: map 0: no millimetres, nobody gave the light" in said and "mm per map unit" not in said
+    record = json.loads((tmp_path / "dense" / "run.json").read_text())
+    assert record["unit"] == "map units" and any("nobody gave the light" in w for w in record["warnings"])
+    told = json.loads((tmp_path / "dense" / "scale.json").read_text())
+    assert {one["mm_per_unit"] for one in told["maps"]} == {None} and told["unit"] == "map units"
+    assert "nobody gave the light" in (tmp_path / "dense" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("output", ["-o", "--output", "--output="])

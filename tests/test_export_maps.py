@@ -24,6 +24,7 @@ from densify.exporting.nerfstudio import intrinsics, write_nerfstudio
 from densify.fusion.volume import FusionConfig
 from densify.judging.config import JudgeConfig
 from densify.pipeline import densify
+from densify.scale_file import MapScale, Scales
 from lightdepth import native
 from lightdepth.camera import Brown, CameraModel, KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.cli import main
@@ -32,6 +33,7 @@ from lightdepth.files.tum import read_tum
 from lightdepth.maps import read_map, write_multimap
 from lightdepth.maps.colmap import write_text_model
 from lightdepth.maps.endocartoscope import read_trajectory
+from lightdepth.photometry import PhotometricCalibration
 from lightdepth.sparse_map import SparseMap
 
 FISHEYE = KannalaBrandt(96, 80, 52.0, 51.0, 47.0, 41.0, -0.05, 0.01, 0.0, 0.0)
@@ -260,6 +262,10 @@ def test_without_its_map_and_frames_a_run_is_still_exported_and_what_is_missing_
     (run / "data").mkdir()
     (run / "data" / "slam").symlink_to(place / "map")  # a demo's run has them inside
     (run / "run.json").write_text(json.dumps({"unit": "mm", "arguments": {"mm_per_unit": MM}}))
+    assert read_exportables(run)[0].tracked
+    (run / "run.json").write_text(json.dumps({"unit": "mm", "arguments": {"mm_per_unit": "light"}}))
+    assert not read_exportables(run)[0].tracked  # the unit of its map is not said
+    Scales((MapScale(0, MM, (2.0, 3.0), "the light"),)).write_file(run, "mm", PhotometricCalibration())
     assert read_exportables(run)[0].tracked
     (run / "run.json").write_text(json.dumps({"unit": "mm"}))
     tracked = ["--map", str(place / "map"), "--data", str(place / "data")]

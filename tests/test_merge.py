@@ -210,11 +210,15 @@ def test_merging_gives_one_surface_of_all_keyframes_that_lies_on_the_single_ones
     merged = merge(results, sequence(frames), truth, QUICK, MergeConfig())
     (result,) = merged.results
     assert len(result.dense.aligned) == 10 and result.seen_share > 0.9
-    record = merged.record(2.0)
+    units = {i: 2.0 + i for i in merged.groups[0]}
+    record = merged.record(units.__getitem__)
     assert record["joined"][0]["folder"] == "joined_000" and record["joined"][0]["maps"] == list(merged.groups[0])
     (transform,) = record["joined"][0]["transforms"]
     similarity = merged.groups[0][transform["first"]]
-    np.testing.assert_allclose(transform["translation"], 2 * similarity.translation)
+    place = np.array([1.0, 2.0, 3.0])  # in the first map's own unit; each map is written in another multiple of its own
+    came = transform["scale"] * np.array(transform["rotation"]) @ (units[transform["first"]] * place)
+    expected = units[transform["second"]] * similarity.apply(place[None])[0]
+    np.testing.assert_allclose(came + transform["translation"], expected)
     assert meeting(maps).groups[0].keys() == merged.groups[0].keys()
 
 

@@ -12,6 +12,7 @@ from lightdepth.light import millimetres as room
 from lightdepth.light.enclosure import Enclosure, enclosure
 from lightdepth.light.looks import Look, Seen, elements, seen_places, typical_distance
 from lightdepth.light.millimetres import Millimetres, millimetres
+from lightdepth.light.shading import fitted
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.tube import render_sequence
 from tests.raising import refused
@@ -203,5 +204,5 @@ def test_factors_of_columns_are_found_beside_gains_and_albedos_under_outliers():
     column, known = rng.normal(size=(6, 80)), rng.random((6, 80)) < 0.8
     left = 0.3 * column + rng.normal(size=(6, 1)) + rng.normal(size=80) + 0.01 * rng.normal(size=(6, 80))
     left[0, :8] += 1.0
-    residual, (factor,) = room._fitted(np.where(known, left, 0), known, np.full((6, 80), 0.01), [column])
+    residual, (factor,) = fitted(np.where(known, left, 0), known, np.full((6, 80), 0.01), [column])
     assert factor == pytest.approx(0.3, abs=0.01) and np.abs(residual[known]).max() > 20

@@ -68,6 +68,7 @@ ROWS = [
     slow("evaluate FRAMES/slam --truth FRAMES -o OUT"),
     "measure FRAMES/run --frame 4 --pixels [[40,30],[60,35]] -o OUT/way.ply",
     "measure FRAMES/run --frame 4 --pixels [[40,30],[60,35]]",
+    "scale FRAMES/run --light gamma=2.2,mu=0 --length.mm 5 --length.ends [[0,0,1],[0,0,2]] --length.map 0 -o OUT",
     "synth --config SETTINGS -o OUT",
     slow("sparse FRAMES --poses FRAMES/truth/poses.tum -o OUT"),
     slow(f"train --preset tube_smoke --data.sequences [FRAMES] --data.val-sequences [OTHERS] {FEW} -o OUT"),

@@ -21,6 +21,7 @@ from densify.dense_map import (
     surface_folders,
 )
 from densify.inputs import fitted_to_frames
+from densify.scale_file import scale_of
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.files.below import given
@@ -102,6 +103,9 @@ def _exportable(
     submap = submaps.get(dense.id) if not folder.name.startswith("joined_") else None
     asked = _argument(record, "mm_per_unit")
     scale = float(asked) if isinstance(asked, (int, float)) and asked else 1.0
+    if asked == "light" and record.get("unit") == "mm":
+        known = scale_of(folder, dense.id)
+        scale = known.mm_per_unit or 1.0 if known is not None else 1.0
     if submap is not None:
         submap = in_unit(submap, scale)
     if submap is not None and not _is_of(submap, dense):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -29,9 +29,9 @@ class Merged:
     def groups(self) -> list[dict[int, Similarity]]:
         return [g for g in self.meeting.groups if len(g) > 1]
 
-    def record(self, unit: float = 1.0) -> dict[str, object]:
+    def record(self, unit: Callable[[int], float] = lambda map_id: 1.0) -> dict[str, object]:
         """For run.json. A transform is as `evaluate --join` reads it: X_second = scale · rotation X_first +
-        translation, where a map's unit is written as `unit`."""
+        translation, where the unit of a map, by its id, is written as `unit`."""
         joined = [_joined(result, g, unit) for result, g in zip(self.results, self.groups, strict=True)]
         joins = [{**asdict(replace(j, target_from_source=None)), "ok": j.ok} for j in self.tried]
         return {"joined": joined, "joins": joins, "alone": self.meeting.alone()}
@@ -45,14 +45,18 @@ def joined_name(result: SubmapResult) -> str:
     return f"joined_{result.dense.submap.id:03d}"
 
 
-def _joined(result: SubmapResult, group: Mapping[int, Similarity], unit: float) -> dict[str, object]:
+def _joined(result: SubmapResult, group: Mapping[int, Similarity], unit: Callable[[int], float]) -> dict[str, object]:
     first = next(iter(group))
-    transforms = [{"first": i, "second": first, **_numbers(s, unit)} for i, s in group.items() if i != first]
+    transforms = [
+        {"first": i, "second": first, **_numbers(s, unit(i), unit(first))} for i, s in group.items() if i != first
+    ]
     return {"folder": joined_name(result), "maps": list(group), "unit_of": first, "transforms": transforms}
 
 
-def _numbers(s: Similarity, unit: float) -> dict[str, object]:
-    return {"scale": s.scale, "rotation": s.rotation.tolist(), "translation": (unit * s.translation).tolist()}
+def _numbers(s: Similarity, first: float, second: float) -> dict[str, object]:
+    """Of what takes coordinates in one written unit to another."""
+    scale = s.scale if first == second else s.scale * second / first
+    return {"scale": scale, "rotation": s.rotation.tolist(), "translation": (second * s.translation).tolist()}
 
 
 def merge(

@@ -13,6 +13,7 @@ from typing import Any
 from densify.dense_map import map_folders
 from densify.measure import run_unit
 from densify.run_frames import run_frames
+from densify.scale_file import unit_told
 from densify.viewing.local_server import Listening, local_server
 from densify.viewing.pictures import Pictures
 from densify.viewing.ruler import Ruler
@@ -117,7 +118,8 @@ def _known(watched: WatchedRun, data: Path | None, mm_per_unit: float | None) ->
 def _unit_meant(watched: WatchedRun, mm_per_unit: float | None) -> str:
     """As `run_unit`, of a run that is still at work."""
     arguments = watched.record.get("arguments")
-    asked = isinstance(arguments, Mapping) and arguments.get("mm_per_unit") is not None
+    given = arguments.get("mm_per_unit") if isinstance(arguments, Mapping) else None
+    asked = given is not None and (given != "light" or unit_told(watched.folder) == "mm")
     if asked and mm_per_unit is not None:
         raise InputError(watched.folder, "its surfaces are in mm already", "leave --mm-per-unit out")
     return "mm" if asked or mm_per_unit is not None else "map units"

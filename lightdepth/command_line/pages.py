@@ -118,7 +118,7 @@ PAGES = {
             "lightdepth densify data/mine --map runs/slam -o runs/dense",
             "lightdepth densify data/mine -o runs/dense --mm-per-unit 3.1 --formats '[ply, glb]'",
         ),
-        rare=("keep_mb",),
+        rare=("keep_mb", "wall_mm"),
         more=("fusion.voxel",),
     ),
     "batch": Page(
@@ -171,6 +171,13 @@ PAGES = {
             "lightdepth bench completion -o runs/completion --inputs true",
             "lightdepth bench completion -o runs/beside --external '[mine=runs/mine]'",
         )
+    ),
+    "scale": Page(
+        (
+            "lightdepth scale runs/dense --light light.json",
+            "lightdepth scale runs/dense --length.ends '[[0, 0, 30], [4, 2, 31]]' --length.mm 5 --length.error-mm 0.3",
+        ),
+        more=("length.ends", "length.mm", "length.error_mm", "length.map"),
     ),
     "measure": Page(
         (

@@ -36,6 +36,7 @@ ORDER = (
     "live",
     "evaluate",
     "bench",
+    "scale",
     "measure",
     "view",
     "export",

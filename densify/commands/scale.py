@@ -1,0 +1,52 @@
+"""The verb scale: millimetres per map unit from the light."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from shlex import quote
+from typing import Annotated
+
+from densify.scale_file import FOLDER
+from densify.scale_run import LengthGiven, ScaleAsked
+from densify.scaling import WALL_MM
+from lightdepth.command_line.outcome import end
+from lightdepth.ranges import above
+from lightdepth.reporting.run import recorded, run_folder
+
+
+def scale(
+    run: Path,
+    light: str | None = None,
+    data: Path | None = None,
+    length: LengthGiven = LengthGiven(),
+    wall_mm: Annotated[float, above(0)] = WALL_MM,
+    output: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Millimetres per map unit of a densify run, from the light beside the lens, with an interval, or why none.
+
+    Args:
+        run: Run folder made by `lightdepth densify`, in map units.
+        light: Light of the endoscope, whose position_mm matters most: a light.json or a photometric XML; left out, the
+            one that the run was given, else that of its frames.
+        data: Frames of the run; left out, those that the run names, where they still are.
+        length: a length that is known
+        wall_mm: Distance of the wall, mm, in the median; scales are looked for that make it .4 to 2.5 times this. A
+            larger one looks for larger scales.
+        output: Folder for scale.json; left out, scale/ in the run, where `measure` finds it.
+        overwrite: Replace a folder made before (scale/ in a run is replaced without asking).
+    """
+    folder = output or run / FOLDER
+    arguments = recorded(run=run, light=light, data=data, length=length, wall_mm=wall_mm, output=folder)
+    asked = ScaleAsked.of(run, light, data, wall_mm, length)
+    with run_folder(folder, "scale", arguments, overwrite or output is None) as out:
+        out.hash_inputs(data=data, light=None if light is None or "=" in light else Path(light))
+        found, under = asked.told()
+        for one in found.maps:
+            (out.log if one.mm_per_unit is not None or not found.told else out.warn)(str(one))
+        found.write_file(out.folder, "map units", under, asked.length_record(length))
+        out.record["maps"] = [asdict(one) for one in found.maps]
+        if not found.told:
+            out.fail("the scale", f"no map has a figure; {found.maps[0]}")
+    end(folder, then=f"lightdepth measure {quote(str(run))} --points '[[X, Y, Z], [X, Y, Z]]'")
