@@ -109,4 +109,4 @@ def read_table(output: Path) -> list[dict[str, Any]]:
 
 def stamps(output: Path) -> dict[str, int]:
     """When each run of an output was finished."""
-    return {path.parent.name: path.stat().st_mtime_ns for path in (output / "sequences").glob("*/run.json")}
+    return {path.parent.name: path.stat().st_mtime_ns for path in (output / "sequences").glob("[!.]*/run.json")}
