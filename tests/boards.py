@@ -54,6 +54,8 @@ class Lamp:
     tilt: tuple[float, float] = (0.0, 0.0)
     """of its axis, radians to the right and down"""
     mu: float = 1.5
+    bare: bool = False
+    """Whether it shines as a bare LED does, with the square of the cosine, in the place of exp(-mu (1 - cosine))"""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,10 @@ class Scene:
     """times that of a usual sensor: 8000 electrons at white, 12 of them read noise"""
     ambient: float = 0.0
     """light of the room, as a share of the lamp's at 20 mm"""
+    shoulder: bool = False
+    """whether the tone curve bends above two thirds"""
+    video: bool = False
+    """whether edges are sharpened and the picture is packed as a JPEG of quality 85"""
     seed: int = 0
 
 
@@ -129,7 +135,9 @@ def photograph(scene: Scene, rotation: np.ndarray, shift: np.ndarray, rng: np.ra
         far = np.linalg.norm(to_lamp, axis=-1)
         to_lamp = to_lamp / far[..., None]
         axis = np.array([*lamp.tilt, 1.0]) / np.linalg.norm([*lamp.tilt, 1.0])
-        beam = lamp.share * np.exp(-lamp.mu * (1 + to_lamp @ axis)) / far**2
+        along = -(to_lamp @ axis)
+        spread = np.clip(along, 0, 1) ** 2 if lamp.bare else np.exp(-lamp.mu * (1 - along))
+        beam = lamp.share * spread / far**2
         half = to_lamp - rays
         half = half / np.linalg.norm(half, axis=-1, keepdims=True)
         mirrored = scene.gloss * np.clip(half @ normal, 0, 1) ** 60
@@ -142,7 +150,13 @@ def photograph(scene: Scene, rotation: np.ndarray, shift: np.ndarray, rng: np.ra
     electrons = 8000 * np.clip(exposed, 0, None)[..., None].repeat(3, -1)
     spread = scene.noise * np.sqrt(electrons + 12**2)
     noisy = np.clip((electrons + spread * rng.standard_normal(electrons.shape)) / 8000, 0, 1)
-    return np.rint(255 * noisy ** (1 / scene.gamma)).astype(np.uint8)
+    code = noisy ** (1 / scene.gamma)
+    if scene.shoulder:
+        code = np.where(code > 0.67, 0.67 + 0.25 * (1 - np.exp(-(code - 0.67) / 0.25)), code)
+    if scene.video:
+        code = np.clip(code + 0.5 * (code - cv2.GaussianBlur(code, (0, 0), 1.2)), 0, 1)
+    image = np.rint(255 * code).astype(np.uint8)
+    return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1], 1) if scene.video else image
 
 
 def write_frames(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -156,13 +156,13 @@ def find_board(image: np.ndarray, board: Board) -> Sighting | None:
 
 def _charuco(grey: np.ndarray, board: Board) -> Sighting | None:
     best: Sighting | None = None
-    markers = None
+    markers: list[Any] = []  # they are the same in both
     for legacy in dict.fromkeys((board.legacy, not board.legacy)):
         one = replace(board, legacy=legacy)
         detector = cv2.aruco.CharucoDetector(one._charuco)
-        pixels, ids, *markers = detector.detectBoard(grey, None, None, *(markers or ()))
+        pixels, ids, *markers = detector.detectBoard(grey, None, None, *markers)
         if ids is not None and len(ids) >= LEAST_CORNERS and (best is None or len(ids) > len(best.places)):
-            at = one._charuco.getChessboardCorners()[ids.ravel(), :2].astype(float)
+            at = np.asarray(one._charuco.getChessboardCorners(), float)[ids.ravel(), :2]
             best = Sighting(one, at, pixels.reshape(-1, 2).astype(float) + 0.5)
         if best is not None or board.squares[1] % 2:  # both ways of drawing are the same where rows are odd
             break

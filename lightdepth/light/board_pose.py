@@ -6,7 +6,7 @@ as good as a pinhole. Notation: X (3,) a place in camera axes [mm], n the board'
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -62,6 +62,13 @@ class White:
 
     def __len__(self) -> int:
         return len(self.log_v)
+
+    def thinned(self, most: int) -> White:
+        """At most so many cells, spread evenly over them."""
+        if len(self) <= most:
+            return self
+        kept = np.linspace(0, len(self) - 1, most).round().astype(int)
+        return replace(self, places=self.places[kept], log_v=self.log_v[kept], noise=self.noise[kept])
 
 
 def board_pose(camera: CameraModel, sighting: Sighting) -> Pose | None:

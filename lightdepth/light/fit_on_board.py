@@ -107,14 +107,25 @@ def fit_on_board(
 ) -> BoardFit:
     """Where the lamps are. Raises InputError where the board is not found, or does not lie where the camera says, where
     its white is saturated, and where the frames do not tell the place."""
-    rng = np.random.default_rng(0) if rng is None else rng
     whites, looked_at = _whites(frames, board)
+    return fit_on_white(whites, config, frames.source, looked_at, rng)
+
+
+def fit_on_white(
+    whites: Sequence[White],
+    config: LampsConfig,
+    source: str,
+    looked_at: int,
+    rng: np.random.Generator | None = None,
+) -> BoardFit:
+    """Where the lamps are, from white paper of several frames. Raises InputError where it does not tell the place."""
+    rng = np.random.default_rng(0) if rng is None else rng
     samples = Samples.of(whites)
     fits, withheld = _by_number(samples, config)
     fit = fits[max(fits)]
     unknowns = Unknowns(len(fit.lamps.shares), config.axis, config.gamma)
     middles = lamp_fit.drawn(samples, unknowns, fit, rng, DRAWS)
-    deviation = np.maximum(fit.deviation, mad_sigmas(middles))
+    deviation = np.maximum(fit.deviation, _mad_sigmas(middles))
     residuals = samples.residuals(fit.lamps, fit.weights) * samples.noise
     by_frame = [mad_sigma(residuals[samples.frame == i]) for i in range(len(whites))]
     off_axis = 1 - samples.places[:, 2] / np.linalg.norm(samples.places, axis=1)
@@ -123,11 +134,11 @@ def fit_on_board(
     found = BoardFit(
         fit, tuple(whites), deviation, mad_sigma(residuals), np.array(by_frame), withheld, looked_at, lens_mu
     )
-    _check(found, frames.source)
+    _check(found, source)
     return found
 
 
-def mad_sigmas(values: np.ndarray) -> np.ndarray:
+def _mad_sigmas(values: np.ndarray) -> np.ndarray:
     """Deviation of each column of (n, k), whatever a few draws do."""
     return np.array([mad_sigma(column - np.median(column)) for column in values.T])
 

@@ -31,7 +31,8 @@ PRIOR_MM, PRIOR_AXIS, PRIOR_MU, PRIOR_LENS, PRIOR_STRAY, PRIOR_GAMMA = 20.0, 0.2
 MU_PRIOR = 2.0  # the middle of it
 _FLOOR = 0.004  # deviation of log V that no averaging takes away: print, paper, pose
 _TOGETHER = 10.0  # neighbouring cells share what is wrong with them: so many count as one against the priors
-_ROUNDS = 4
+_ROUNDS = 3
+_MOST_CELLS = 100  # of a frame: more say the same
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,8 @@ class Samples:
     frame: np.ndarray
 
     @classmethod
-    def of(cls, whites: Sequence[White]) -> Samples:
+    def of(cls, every: Sequence[White]) -> Samples:
+        whites = [white.thinned(_MOST_CELLS) for white in every]
         return cls(
             np.concatenate([white.places for white in whites]),
             np.concatenate([np.tile(white.pose.normal, (len(white), 1)) for white in whites]),
@@ -157,7 +159,7 @@ def fit_lamps(samples: Samples, unknowns: Unknowns, times: np.ndarray | None = N
     if start is None:
         even = np.ones(len(counted))
         begun = [unknowns.start(places) for places in _starts(unknowns.lamps)]
-        start = min((_from(samples, unknowns, counted, x, even, 1) for x in begun), key=lambda fit: fit.sigma)
+        start = min((_from(samples, unknowns, counted, x, even, 1, 80) for x in begun), key=lambda fit: fit.sigma)
         return _from(samples, unknowns, counted, start.x, start.weights, _ROUNDS)
     return _from(samples, unknowns, counted, start.x, start.weights, 1)
 
@@ -174,7 +176,13 @@ def _starts(lamps: int) -> list[np.ndarray]:
 
 
 def _from(
-    samples: Samples, unknowns: Unknowns, counted: np.ndarray, x: np.ndarray, weights: np.ndarray, rounds: int
+    samples: Samples,
+    unknowns: Unknowns,
+    counted: np.ndarray,
+    x: np.ndarray,
+    weights: np.ndarray,
+    rounds: int,
+    most: int = 250,
 ) -> Fit:
     sigma, solved = 1.0, None
     for _ in range(rounds):
@@ -185,7 +193,7 @@ def _from(
             pull = unknowns.prior(x) * np.sqrt(_TOGETHER)
             return np.concatenate([root * samples.residuals(unknowns.lamps_of(x), use) / sigma, pull])
 
-        solved = least_squares(left, x, method="lm", x_scale="jac", max_nfev=300)
+        solved = least_squares(left, x, method="lm", x_scale="jac", max_nfev=most, xtol=1e-5, ftol=1e-6)
         x = solved.x
         residuals = samples.residuals(unknowns.lamps_of(x), use)
         sigma = mad_sigma(np.repeat(residuals, counted.astype(int)), least=0.3)
