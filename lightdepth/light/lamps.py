@@ -26,7 +26,7 @@ from lightdepth.light.board_pose import White
 from lightdepth.photometry import DEFAULT_GAMMA
 from lightdepth.robust import mad_sigma, robust_weights
 
-PRIOR_MM, PRIOR_AXIS, PRIOR_MU, PRIOR_LENS, PRIOR_STRAY, PRIOR_GAMMA = 20.0, 0.2, 2.0, 1.0, 0.01, 0.15
+PRIOR_MM, PRIOR_AXIS, PRIOR_MU, PRIOR_LENS, PRIOR_STRAY, PRIOR_GAMMA = 20.0, 0.2, 2.0, 1.0, 0.02, 0.15
 """Deviations; the last of 1 / gamma."""
 MU_PRIOR = 2.0  # the middle of it
 _FLOOR = 0.004  # deviation of log V that no averaging takes away: print, paper, pose
