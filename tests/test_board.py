@@ -83,15 +83,15 @@ def test_one_lamp_is_found_where_it_is(world):
 
 def test_what_the_lens_darkens_is_told_from_the_lamps_spread_and_both_are_in_mu():
     found = found_on(paper(lens=1.5))
-    assert found.fit.lamps.mu == pytest.approx(1.5, abs=0.15) and found.lens_mu == pytest.approx(1.6, abs=0.2)
+    assert found.lamp_mu == pytest.approx(1.5, abs=0.3) and found.lens_mu == pytest.approx(1.6, abs=0.35)
     light = found.light
-    assert light.lamps is not None and light.mu == pytest.approx(found.fit.lamps.mu + light.lamps.lens_mu, abs=1e-3)
+    assert light.lamps is not None and light.mu == pytest.approx(found.lamp_mu + light.lamps.lens_mu, abs=1e-3)
 
 
 def test_two_lamps_are_told_from_one_by_frames_that_were_kept_from_the_fit():
     two = [(2.6, 0.4, -0.3, 0.6), (-2.2, 0.6, -0.3, 0.4)]
     found = found_on(paper(two), LampsConfig())
-    assert len(found.fit.lamps.shares) == 2 and found.withheld[2] < 0.95 * found.withheld[1]
+    assert len(found.fit.lamps.shares) == 2 and found.withheld[2] < 0.9 * found.withheld[1]
     order = np.argsort(-found.fit.lamps.places[:, 0])
     assert found.fit.lamps.places[order] == pytest.approx(np.array(two)[:, :3], abs=0.25)
     assert found.light.position_mm == pytest.approx((0.68, 0.48, -0.3), abs=0.15)
@@ -185,7 +185,7 @@ def frames_of(folder, *more):
 
 def test_a_board_that_is_not_there_is_refused_with_what_is(folder, tmp_path):
     with refused("found in 0 of 7 frames; markers of 4x4 are there", cure="--board.dictionary"):
-        fit_on_board(frames_of(folder), replace(CHARUCO, dictionary="6x6_50"))
+        fit_on_board(frames_of(folder), replace(CHARUCO, dictionary="6x6"))
     with refused("a checkerboard of 7 by 5 squares was found in 0 of 7 frames"):
         fit_on_board(frames_of(folder), Board("checkerboard", (7, 5), 5.0))
     placed = [(turned(np.array([0.2, 0, 0])), np.array([-17.0, -12, 32]))] * 5
@@ -225,8 +225,8 @@ def test_a_board_without_a_size_is_wrong_usage_and_sizes_that_contradict_each_ot
     assert Board.of("checkerboard", BoardConfig((9, 7), 4.0)).squares == (9, 7)
     with refused("--board.marker-mm", cure="less than the square's side"):
         Board.of("charuco", BoardConfig((9, 7), 4.0, 4.0))
-    with refused("--board.dictionary", "4x4_50 has 50 markers"):
-        Board.of("charuco", BoardConfig((20, 20), 4.0, 3.0))
+    with refused("--board.dictionary", "4x4 has 1000 markers"):
+        Board.of("charuco", BoardConfig((60, 60), 4.0, 3.0))
 
 
 # ---- the file

@@ -18,9 +18,9 @@ from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import write_together
-from lightdepth.light.board import Board, BoardConfig, Kind
+from lightdepth.light.board import Board
 from lightdepth.light.board_page import board_page
-from lightdepth.light.fit_on_board import LampsConfig, fit_on_board
+from lightdepth.light.fit_on_board import LampsConfig, PositionConfig, fit_on_board
 from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.light.report import light_page
@@ -39,9 +39,7 @@ def calibrate_light(
     bit_depth: Annotated[int | None, Range(8, 32)] = None,
     seed: Annotated[int, SEED] = 0,
     pairing: Group[PairingConfig] = PairingConfig(),
-    position: Kind | None = None,
-    board: BoardConfig = BoardConfig(),
-    lamps: LampsConfig = LampsConfig(),
+    sought: Group[PositionConfig] = PositionConfig(),
     overwrite: bool = False,
 ) -> None:
     """The light of an endoscope: response and spread, from a map or known depth; its position, from a printed board.
@@ -60,11 +58,6 @@ def calibrate_light(
             their highest values show. A larger one reads the same numbers as darker.
         seed: Number that draws the bootstrap samples, which tell how sure the light is. Another one gives slightly
             different intervals.
-        position: What printed board the frames show, charuco or checkerboard: from its white paper the position of the
-            light is found, in millimetres, with response and spread. --board.squares and --board.square-mm say its
-            size. Left out, no position is sought.
-        board: The printed board.
-        lamps: What is sought of the lamps.
         overwrite: Replace files that an earlier run made.
     """
     page_path = output.with_suffix(".html")
@@ -77,12 +70,12 @@ def calibrate_light(
     check_files([output, page_path], overwrite, [data, map, camera, mask])
     rng = np.random.default_rng(seed)
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth)
-    if position is not None:
+    if sought.position is not None:
         if map is not None:
             raise InputError("--position", "with --map", "give one of them: a board's own poses are found on it")
-        _from_board(source, Board.of(position, board), lamps, rng, output)
+        _from_board(source, Board.of(sought.position, sought.board), sought.lamps, rng, output)
         return
-    if (board, lamps) != (BoardConfig(), LampsConfig()):
+    if sought != PositionConfig():
         raise InputError("--board, --lamps", "without --position", "say which board it is: --position charuco")
     if map is None:
         fit = fit_on_truth(source.open(), rng)

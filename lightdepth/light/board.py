@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -19,25 +19,7 @@ from lightdepth.errors import InputError, MissingOption
 from lightdepth.ranges import Range, above, checked
 
 Kind = Literal["charuco", "checkerboard"]
-Dictionary = Literal[
-    "4x4_50",
-    "4x4_100",
-    "4x4_250",
-    "4x4_1000",
-    "5x5_50",
-    "5x5_100",
-    "5x5_250",
-    "5x5_1000",
-    "6x6_50",
-    "6x6_100",
-    "6x6_250",
-    "6x6_1000",
-    "7x7_50",
-    "7x7_100",
-    "7x7_250",
-    "7x7_1000",
-    "original",
-]
+Dictionary = Literal["4x4", "5x5", "6x6", "7x7", "original"]
 LEAST_CORNERS = 8
 """Fewer do not tell how a board is tilted."""
 _PART = 60  # samples of the drawing a square
@@ -55,8 +37,9 @@ class BoardConfig:
     """Side of a square on the print, mm: all millimetres come from it. A larger one puts the light further away."""
     marker_mm: Annotated[float | None, above(0, up_to=1000)] = None
     """Side of a marker of a charuco board, mm, its black border included. A larger one leaves less white around it."""
-    dictionary: Dictionary = "4x4_50"
-    """Dictionary of a charuco board's markers, as the program that drew it calls it (OpenCV's names)."""
+    dictionary: Dictionary = "4x4"
+    """Dots of a charuco board's markers, across and down; of OpenCV's dictionaries, or ArUco's original one. How many
+    markers the dictionary has, as in 4x4_250, does not matter: the first ones are the same."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +50,7 @@ class Board:
     squares: tuple[int, int]
     square_mm: float
     marker_mm: float = 0.0
-    dictionary: Dictionary = "4x4_50"
+    dictionary: Dictionary = "4x4"
     legacy: bool = False
     """Whether the markers of a charuco board begin in its first square, as OpenCV drew them before 4.6."""
     odd: bool = False
@@ -90,7 +73,7 @@ class Board:
                 "expected less than the square's side, and a fifth of it at least",
             )
         board = cls(kind, config.squares, config.square_mm, config.marker_mm, config.dictionary)
-        needed, held = config.squares[0] * config.squares[1] // 2, len(board._words.bytesList)
+        needed, held = board._markers, len(_words(config.dictionary, 1000).bytesList)
         if needed > held:
             raise InputError(
                 "--board.dictionary",
@@ -106,7 +89,11 @@ class Board:
 
     @property
     def _words(self) -> cv2.aruco.Dictionary:
-        return _words(self.dictionary)
+        return _words(self.dictionary, self._markers)
+
+    @property
+    def _markers(self) -> int:
+        return self.squares[0] * self.squares[1] // 2
 
     @property
     def _charuco(self) -> cv2.aruco.CharucoBoard:
@@ -194,17 +181,19 @@ def what_is_there(images: Sequence[np.ndarray], board: Board) -> str:
             if min(squares) >= 3 and any(find_board(image, replace(board, squares=squares)) for image in images):
                 return f"a checkerboard of {_by(squares)} squares is there"
         return ""
-    for name in ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "original"):
-        detector = cv2.aruco.ArucoDetector(_words(name))
+    for name in get_args(Dictionary):
+        detector = cv2.aruco.ArucoDetector(_words(name, 250))
         seen = [ids.ravel() for image in images if (ids := detector.detectMarkers(_grey8(image))[1]) is not None]
         if seen and max(map(len, seen)) >= 4:
-            return f"markers of {name.partition('_')[0]} are there, with numbers up to {max(map(np.max, seen))}"
+            return f"markers of {name} are there, with numbers up to {max(map(np.max, seen))}"
     return ""
 
 
-def _words(name: str) -> cv2.aruco.Dictionary:
-    code = name.upper() if name != "original" else "ARUCO_ORIGINAL"
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{code}"))
+def _words(name: str, markers: int) -> cv2.aruco.Dictionary:
+    """The smallest dictionary that has so many markers: fewer words are told apart better."""
+    held = next((n for n in (50, 100, 250) if n >= markers), 1000)
+    code = "DICT_ARUCO_ORIGINAL" if name == "original" else f"DICT_{name.upper()}_{held}"
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, code))
 
 
 def _grey8(image: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -13,7 +13,7 @@ from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.frame import readable
 from lightdepth.light import lamps as lamp_fit
-from lightdepth.light.board import Board, find_board, what_is_there
+from lightdepth.light.board import Board, BoardConfig, Kind, find_board, what_is_there
 from lightdepth.light.board_pose import White, board_pose, white_paper
 from lightdepth.light.fit_on_map import GAMMA_RANGE
 from lightdepth.light.lamps import Fit, Samples, Unknowns, fit_lamps
@@ -27,7 +27,7 @@ MOST_CLIPPED = 0.5  # of the white pixels, over the frames
 MOST_ASTRAY = 0.003  # root mean square error of the corners, as a share of the image's width
 WIDEST_MM = 1.0  # half of the interval of a coordinate, from which a place is none
 MOST_LEFT = 0.04  # of the code values, which the lamps do not explain
-GAIN_NEEDED = 0.95  # one lamp more must leave at most this share of what frames that were withheld leave
+GAIN_NEEDED = 0.9  # one lamp more must leave at most this share of what frames that were withheld leave
 NEAREST_MM, LEAST_SHARE = 0.5, 0.08  # two lamps nearer to each other are one; a lamp with less light is none
 DRAWS = 400
 CONFIDENCE = 0.9
@@ -49,6 +49,20 @@ class LampsConfig:
 
 
 @dataclass(frozen=True)
+class PositionConfig:
+    """Whether the lamps' place is sought, on what, and how."""
+
+    position: Kind | None = None
+    """What printed board the frames show, charuco or checkerboard: from its white paper the position of the light is
+    found, in millimetres, with response and spread. --board.squares and --board.square-mm say its size. Left out, no
+    position is sought."""
+    board: BoardConfig = field(default_factory=BoardConfig)
+    """The printed board."""
+    lamps: LampsConfig = field(default_factory=LampsConfig)
+    """What is sought of the lamps."""
+
+
+@dataclass(frozen=True)
 class BoardFit:
     """Lamps, the frames they rest on, and how sure their place is. `deviation` (3,) [mm] is of the lamps' middle, the
     larger of what frames drawn anew show and what the fit's own curvature does; `left` what is left over of code
@@ -62,6 +76,7 @@ class BoardFit:
     withheld: dict[int, float]
     looked_at: int
     lens_mu: float
+    lamp_mu: float
 
     @property
     def half_width(self) -> np.ndarray:
@@ -75,7 +90,7 @@ class BoardFit:
         lens_mu = round(self.lens_mu, 4)
         return PhotometricCalibration(
             gamma=round(lamps.gamma, 4),
-            mu=max(round(lamps.mu + self.lens_mu, 4), 0.0),
+            mu=max(round(self.lamp_mu + self.lens_mu, 4), 0.0),
             position_mm=_triple(lamps.middle),
             direction=_triple(lamps.axis, 6),
             source="measured",
@@ -129,10 +144,10 @@ def fit_on_white(
     residuals = samples.residuals(fit.lamps, fit.weights) * samples.noise
     by_frame = [mad_sigma(residuals[samples.frame == i]) for i in range(len(whites))]
     off_axis = 1 - samples.places[:, 2] / np.linalg.norm(samples.places, axis=1)
-    darker = fit.lamps.lens[0] * off_axis + fit.lamps.lens[1] * off_axis**2
-    lens_mu = float(off_axis @ darker / max(float(off_axis @ off_axis), 1e-9))
+    bend = float((off_axis**3).sum() / max((off_axis**2).sum(), 1e-9))  # of a square, the line that is nearest to it
+    lens_mu, lamp_mu = fit.lamps.lens[0] + bend * fit.lamps.lens[1], fit.lamps.mu + bend * fit.lamps.edge
     found = BoardFit(
-        fit, tuple(whites), deviation, mad_sigma(residuals), np.array(by_frame), withheld, looked_at, lens_mu
+        fit, tuple(whites), deviation, mad_sigma(residuals), np.array(by_frame), withheld, looked_at, lens_mu, lamp_mu
     )
     _check(found, source)
     return found

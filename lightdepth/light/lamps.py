@@ -5,7 +5,7 @@ the camera's axis, b = 1 - cos psi; lamp k at P_k [mm] with share s_k (sum 1); D
 l_k = (X - P_k) / |X - P_k|; V the code value, c one constant per frame (gain, exposure, the paper's albedo).
 
     log V = c + 1/gamma (log (E + a) - nu b - nu' b²)
-    E     = sum_k s_k exp(-mu (1 - D · l_k)) (n · -l_k) / |X - P_k|²
+    E     = sum_k s_k exp(-mu b_k - mu' b_k²) (n · -l_k) / |X - P_k|²,   b_k = 1 - D · l_k
 
 nu and nu' are the lens's own darkening to the side, which stays with the camera where mu moves with the lamps; a is
 light of the room and stray light, as a share of the typical E.
@@ -37,13 +37,14 @@ _MOST_CELLS = 100  # of a frame: more say the same
 
 @dataclass(frozen=True)
 class Lamps:
-    """Lamps of one kind: places (k, 3) [mm], shares (k,), axis (3,) unit, mu, gamma; `lens` is (nu, nu'), `stray` a."""
+    """Lamps of one kind: places (k, 3) [mm], shares (k,), axis (3,) unit, mu, gamma; `edge` is mu', `lens` (nu, nu'), `stray` a."""
 
     places: np.ndarray
     shares: np.ndarray
     axis: np.ndarray
     mu: float
     gamma: float
+    edge: float = 0.0
     lens: tuple[float, float] = (0.0, 0.0)
     stray: float = 0.0
 
@@ -58,7 +59,8 @@ class Lamps:
         from_lamp = places[:, None] - self.places
         reach = np.linalg.norm(from_lamp, axis=-1)
         cosine = -np.einsum("nkj,nj->nk", from_lamp, normals) / reach
-        spread = np.exp(-self.mu * (1 - from_lamp @ self.axis / reach))
+        off_axis = 1 - from_lamp @ self.axis / reach
+        spread = np.exp(-self.mu * off_axis - self.edge * off_axis**2)
         light = (self.shares * spread * np.maximum(cosine, 1e-3) / reach**2).sum(-1)
         light = light + self.stray * float(np.median(light))
         aside = 1 - places[:, 2] / np.linalg.norm(places, axis=-1)
@@ -116,23 +118,26 @@ class Unknowns:
         k = self.lamps
         shares = np.exp(np.concatenate([[0.0], x[3 * k : 4 * k - 1]]))
         rest = x[4 * k - 1 :]
-        mu, rest = rest[0], rest[1:]
+        mu, edge, rest = float(rest[0]), float(rest[1]), rest[2:]
         tilt, rest = (rest[:2], rest[2:]) if self.axis else ((0.0, 0.0), rest)
         lens, rest = (rest[:2], rest[2:]) if self.lens else ((0.0, 0.0), rest)
         stray, rest = (rest[0], rest[1:]) if self.stray else (0.0, rest)
         axis = np.array([*tilt, 1.0]) / np.linalg.norm([*tilt, 1.0])
         gamma = self.gamma or 1 / max(float(rest[0]), 0.05)
         places, beside = x[: 3 * k].reshape(k, 3), (float(lens[0]), float(lens[1]))
-        return Lamps(places, shares / shares.sum(), axis, float(mu), gamma, beside, float(stray))
+        return Lamps(places, shares / shares.sum(), axis, mu, gamma, edge, beside, float(stray))
 
     def start(self, places: np.ndarray) -> np.ndarray:
-        free = [*[0.0] * (2 * self.axis + 2 * self.lens + self.stray), *([1 / DEFAULT_GAMMA] * (self.gamma is None))]
+        free = [
+            *[0.0] * (1 + 2 * self.axis + 2 * self.lens + self.stray),
+            *([1 / DEFAULT_GAMMA] * (self.gamma is None)),
+        ]
         return np.concatenate([places.ravel(), np.zeros(self.lamps - 1), [MU_PRIOR], free])
 
     def prior(self, x: np.ndarray) -> np.ndarray:
         """How far unknowns are from what is expected, in deviations."""
         k, start = self.lamps, self.start(np.zeros((self.lamps, 3)))
-        wide = [*[PRIOR_MM] * 3 * k, *[1.0] * (k - 1), PRIOR_MU, *[PRIOR_AXIS] * 2 * self.axis]
+        wide = [*[PRIOR_MM] * 3 * k, *[1.0] * (k - 1), PRIOR_MU, PRIOR_LENS, *[PRIOR_AXIS] * 2 * self.axis]
         wide += [*[PRIOR_LENS] * 2 * self.lens, *[PRIOR_STRAY] * self.stray]
         found: np.ndarray = (x - start) / np.array([*wide, *[PRIOR_GAMMA] * (self.gamma is None)])
         return found
