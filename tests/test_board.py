@@ -148,6 +148,23 @@ def test_a_board_is_found_and_lies_where_it_was_put(lens, charuco):
     assert len(white) > 50 and np.exp(white.log_v).min() > 0.3  # the print is at .2 and below
 
 
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_charuco_board_that_begins_with_a_marker_has_its_white_there(legacy):
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    drawing = cv2.aruco.CharucoBoard((7, 6), 5.0, 3.5, words)
+    drawing.setLegacyPattern(legacy)
+    image = drawing.generateImage((360, 310), marginSize=20)[..., None].repeat(3, -1).astype(np.float32) / 255
+    sighting = find_board(image, Board("charuco", (7, 6), 5.0, 3.5))
+    assert sighting is not None and len(sighting.places) == 30
+    assert (sighting.board.white_within(np.array([[2.5, 0.4], [7.5, 0.4]])) > 0).tolist() == [legacy, not legacy]
+
+
+def test_an_image_without_anything_in_it_shows_no_board():
+    for level in (0.0, 1.0):
+        for board in (CHARUCO, Board("checkerboard", (7, 5), 5.0)):
+            assert find_board(np.full((90, 120, 3), level, np.float32), board) is None
+
+
 @pytest.mark.parametrize("turn", range(4))
 def test_a_checkerboard_that_is_lopsided_has_its_white_where_the_image_is_bright(turn):
     scene = replace(SMALL, charuco=False, squares=(8, 5))

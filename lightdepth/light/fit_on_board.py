@@ -207,7 +207,8 @@ def _whites(frames: FrameSequence, board: Board) -> tuple[list[White], int]:
 
 def _by_number(samples: Samples, config: LampsConfig) -> tuple[dict[int, Fit], dict[int, float]]:
     """Fits by their number of lamps, one more as long as withheld frames speak for it, and what these leave."""
-    fits, withheld = {}, {}
+    fits: dict[int, Fit] = {}
+    withheld: dict[int, float] = {}
     for number in (config.number,) if config.number else (1, 2, 3):
         unknowns = Unknowns(number, config.axis, config.gamma)
         fit = fit_lamps(samples, unknowns)

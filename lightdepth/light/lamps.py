@@ -37,7 +37,8 @@ _MOST_CELLS = 100  # of a frame: more say the same
 
 @dataclass(frozen=True)
 class Lamps:
-    """Lamps of one kind: places (k, 3) [mm], shares (k,), axis (3,) unit, mu, gamma; `edge` is mu', `lens` (nu, nu'), `stray` a."""
+    """Lamps of one kind: places (k, 3) [mm], shares (k,), axis (3,) unit, mu, gamma; `edge` is mu', `lens` (nu, nu'),
+    `stray` a."""
 
     places: np.ndarray
     shares: np.ndarray
@@ -111,8 +112,6 @@ class Unknowns:
     lamps: int = 1
     axis: bool = True
     gamma: float | None = None
-    lens: bool = True
-    stray: bool = True
 
     def lamps_of(self, x: np.ndarray) -> Lamps:
         k = self.lamps
@@ -120,8 +119,7 @@ class Unknowns:
         rest = x[4 * k - 1 :]
         mu, edge, rest = float(rest[0]), float(rest[1]), rest[2:]
         tilt, rest = (rest[:2], rest[2:]) if self.axis else ((0.0, 0.0), rest)
-        lens, rest = (rest[:2], rest[2:]) if self.lens else ((0.0, 0.0), rest)
-        stray, rest = (rest[0], rest[1:]) if self.stray else (0.0, rest)
+        lens, stray, rest = rest[:2], rest[2], rest[3:]
         axis = np.array([*tilt, 1.0]) / np.linalg.norm([*tilt, 1.0])
         gamma = self.gamma or 1 / max(float(rest[0]), 0.05)
         places, beside = x[: 3 * k].reshape(k, 3), (float(lens[0]), float(lens[1]))
@@ -129,7 +127,7 @@ class Unknowns:
 
     def start(self, places: np.ndarray) -> np.ndarray:
         free = [
-            *[0.0] * (1 + 2 * self.axis + 2 * self.lens + self.stray),
+            *[0.0] * (4 + 2 * self.axis),
             *([1 / DEFAULT_GAMMA] * (self.gamma is None)),
         ]
         return np.concatenate([places.ravel(), np.zeros(self.lamps - 1), [MU_PRIOR], free])
@@ -138,7 +136,7 @@ class Unknowns:
         """How far unknowns are from what is expected, in deviations."""
         k, start = self.lamps, self.start(np.zeros((self.lamps, 3)))
         wide = [*[PRIOR_MM] * 3 * k, *[1.0] * (k - 1), PRIOR_MU, PRIOR_LENS, *[PRIOR_AXIS] * 2 * self.axis]
-        wide += [*[PRIOR_LENS] * 2 * self.lens, *[PRIOR_STRAY] * self.stray]
+        wide += [PRIOR_LENS, PRIOR_LENS, PRIOR_STRAY]
         found: np.ndarray = (x - start) / np.array([*wide, *[PRIOR_GAMMA] * (self.gamma is None)])
         return found
 
@@ -233,7 +231,7 @@ def drawn(samples: Samples, unknowns: Unknowns, fit: Fit, rng: np.random.Generat
         rows = samples.frame == i
         square[i], pull[i] = slopes[rows].T @ slopes[rows], slopes[rows].T @ left[rows]
     prior = of_prior.T @ of_prior
-    found = []
+    found: list[np.ndarray] = []
     while len(found) < draws:
         times = rng.multinomial(frames, np.full(frames, 1 / frames))
         if (times > 0).sum() >= min(4, frames):
@@ -246,7 +244,7 @@ def drawn(samples: Samples, unknowns: Unknowns, fit: Fit, rng: np.random.Generat
 def withheld(samples: Samples, unknowns: Unknowns, fit: Fit, folds: int = 4) -> float:
     """Median size of what is left over of frames that were kept from the fit, in deviations."""
     frames = np.arange(int(samples.frame.max()) + 1)
-    left = []
+    left: list[np.ndarray] = []
     for fold in range(min(folds, len(frames))):
         kept = frames % folds != fold
         lamps = fit_lamps(samples, unknowns, kept.astype(int), fit).lamps
