@@ -29,7 +29,7 @@ DEFAULT_GAMMA, DEFAULT_MU = 2.2, 2.767
 
 
 @dataclass(frozen=True)
-class Lamps:
+class MeasuredLamps:
     """The lamps that a light consists of, and how well their place is known, where it was measured.
 
     `positions_mm` in camera axes; `shares` of the light, sum 1; `deviation_mm` the standard deviation of the light's
@@ -82,11 +82,11 @@ class PhotometricCalibration:
     gain: float = 1.0
     reflectance: float = 0.0
     source: str = "assumed"
-    lamps: Lamps | None = None
+    lamps: MeasuredLamps | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.lamps, Mapping):  # of a record that was written as JSON
-            object.__setattr__(self, "lamps", Lamps(**self.lamps))
+            object.__setattr__(self, "lamps", MeasuredLamps(**self.lamps))
         if len(self.position_mm) != 3 or len(self.direction) != 3:
             raise InputError(
                 "light", f"position_mm {self.position_mm}, direction {self.direction}", "expected 3 numbers each"

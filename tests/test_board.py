@@ -19,7 +19,7 @@ from lightdepth.frame import Frame
 from lightdepth.light.board import Board, BoardConfig, find_board
 from lightdepth.light.board_pose import Pose, White, board_pose, white_paper
 from lightdepth.light.fit_on_board import LampsConfig, fit_on_board, fit_on_white
-from lightdepth.photometry import Lamps, PhotometricCalibration
+from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
 from tests.raising import refused
 
 PLACE = np.array([2.5, -1.0, -0.5])
@@ -159,10 +159,11 @@ def test_a_charuco_board_that_begins_with_a_marker_has_its_white_there(legacy):
     assert (sighting.board.white_within(np.array([[2.5, 0.4], [7.5, 0.4]])) > 0).tolist() == [legacy, not legacy]
 
 
-def test_an_image_without_anything_in_it_shows_no_board():
+@pytest.mark.parametrize("size", [(1, 1), (90, 120)])
+def test_an_image_without_anything_in_it_shows_no_board(size):
     for level in (0.0, 1.0):
         for board in (CHARUCO, Board("checkerboard", (7, 5), 5.0)):
-            assert find_board(np.full((90, 120, 3), level, np.float32), board) is None
+            assert find_board(np.full((*size, 3), level, np.float32), board) is None
 
 
 @pytest.mark.parametrize("turn", range(4))
@@ -250,7 +251,7 @@ def test_a_board_without_a_size_is_wrong_usage_and_sizes_that_contradict_each_ot
 
 
 def test_lamps_survive_their_file_and_a_light_without_them_is_written_as_before(tmp_path):
-    lamps = Lamps(((1.0, 2.0, 0.0), (-1, 2, 0)), (0.25, 0.75), (0.1, 0.1, 0.2), 0.3)
+    lamps = MeasuredLamps(((1.0, 2.0, 0.0), (-1, 2, 0)), (0.25, 0.75), (0.1, 0.1, 0.2), 0.3)
     light = PhotometricCalibration(position_mm=(-0.5, 2, 0), source="measured", lamps=lamps)
     write_light(light, tmp_path / "light.json")
     assert read_light(tmp_path / "light.json") == light

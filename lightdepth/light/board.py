@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import lru_cache
 from typing import Annotated, Any, Literal, get_args
 
 import cv2
@@ -22,6 +22,7 @@ Kind = Literal["charuco", "checkerboard"]
 Dictionary = Literal["4x4", "5x5", "6x6", "7x7", "original"]
 LEAST_CORNERS = 8
 """Fewer do not tell how a board is tilted."""
+_LEAST_SIDE = 24  # pixels of an image
 _PART = 60  # samples of the drawing a square
 
 
@@ -101,27 +102,14 @@ class Board:
         made.setLegacyPattern(self.legacy)
         return made
 
-    @cached_property
-    def _white(self) -> np.ndarray:
-        """Distance [mm] of places of the print from what is not white, `_PART` places a square."""
-        across, down = (n * _PART for n in self.squares)
-        if self.kind == "charuco":
-            drawn = self._charuco.generateImage((across, down), marginSize=0)
-        else:
-            row, column = np.indices((down, across)) // _PART
-            drawn = np.where((row + column) % 2 == int(self.odd), 0, 255)
-        white = cv2.copyMakeBorder((drawn > 127).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-        away = cv2.distanceTransform(white, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-        result: np.ndarray = away * (self.square_mm / _PART)
-        return result
-
     def white_within(self, places: np.ndarray) -> np.ndarray:
         """How far [mm] places (n, 2) of the print are from what is not white; 0 where they are not white themselves,
         and beside the squares."""
         column, row = np.floor(places * (_PART / self.square_mm)).astype(int).T
-        height, width = self._white.shape
+        white = _white(self)
+        height, width = white.shape
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        found: np.ndarray = np.where(inside, self._white[np.where(inside, row, 0), np.where(inside, column, 0)], 0.0)
+        found: np.ndarray = np.where(inside, white[np.where(inside, row, 0), np.where(inside, column, 0)], 0.0)
         return found
 
 
@@ -138,6 +126,8 @@ class Sighting:
 def find_board(image: np.ndarray, board: Board) -> Sighting | None:
     """The board in an image (H, W, 3) in [0, 1]; None where fewer than eight of its corners are seen (of a
     checkerboard, where any is not)."""
+    if min(image.shape[:2]) < _LEAST_SIDE:
+        return None
     return _charuco(_grey8(image), board) if board.kind == "charuco" else _checkerboard(_grey8(image), board)
 
 
@@ -173,6 +163,22 @@ def _checkerboard(grey: np.ndarray, board: Board) -> Sighting | None:
     return Sighting(replace(board, odd=odd), places, pixels + 0.5)
 
 
+@lru_cache(maxsize=4)
+def _white(board: Board) -> np.ndarray:
+    """Distance [mm] of places of the print from what is not white, `_PART` places a square. Read-only: it is kept."""
+    across, down = (n * _PART for n in board.squares)
+    if board.kind == "charuco":
+        drawn = board._charuco.generateImage((across, down), marginSize=0)
+    else:
+        row, column = np.indices((down, across)) // _PART
+        drawn = np.where((row + column) % 2 == int(board.odd), 0, 255)
+    white = cv2.copyMakeBorder((drawn > 127).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    away = cv2.distanceTransform(white, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    result: np.ndarray = away * (board.square_mm / _PART)
+    result.flags.writeable = False
+    return result
+
+
 def what_is_there(images: Sequence[np.ndarray], board: Board) -> str:
     """What images show in place of a board that was not found, for a sentence; "" where nothing is recognised."""
     across, down = board.squares
@@ -181,6 +187,7 @@ def what_is_there(images: Sequence[np.ndarray], board: Board) -> str:
             if min(squares) >= 3 and any(find_board(image, replace(board, squares=squares)) for image in images):
                 return f"a checkerboard of {_by(squares)} squares is there"
         return ""
+    images = [image for image in images if min(image.shape[:2]) >= _LEAST_SIDE]
     for name in get_args(Dictionary):
         detector = cv2.aruco.ArucoDetector(_words(name, 250))
         seen = [ids.ravel() for image in images if (ids := detector.detectMarkers(_grey8(image))[1]) is not None]

@@ -17,7 +17,7 @@ from lightdepth.light.board import Board, BoardConfig, Kind, find_board, what_is
 from lightdepth.light.board_pose import White, board_pose, white_paper
 from lightdepth.light.fit_on_map import GAMMA_RANGE
 from lightdepth.light.lamps import Fit, Samples, Unknowns, fit_lamps
-from lightdepth.photometry import Lamps, PhotometricCalibration
+from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
 from lightdepth.ranges import Range, checked
 from lightdepth.robust import mad_sigma
 
@@ -94,7 +94,7 @@ class BoardFit:
             position_mm=_triple(lamps.middle),
             direction=_triple(lamps.axis, 6),
             source="measured",
-            lamps=Lamps(
+            lamps=MeasuredLamps(
                 tuple(map(_triple, lamps.places)),
                 tuple(float(share) for share in lamps.shares),
                 _triple(self.deviation, 4),
@@ -110,7 +110,8 @@ class BoardFit:
         many = "" if len(lamps.shares) == 1 else f" (the middle of {len(lamps.shares)} lamps)"
         return (
             f"at {place} mm{many}, nine of ten times; gamma {lamps.gamma:.2f}, mu {self.light.mu:.2f}, of which the "
-            f"lens {self.lens_mu:.2f}; {len(self.whites)} frames, of whose white {self.left:.1%} is left over"
+            f"lens {self.lens_mu:.2f}; {len(self.whites)} of {self.looked_at} frames, of whose white {self.left:.1%} "
+            "is left over"
         )
 
 
@@ -238,7 +239,7 @@ def _check(found: BoardFit, source: str) -> None:
     )
     place = f"x {lamps.middle[0]:.2f} ± {wide[0]:.2f}, y {lamps.middle[1]:.2f} ± {wide[1]:.2f}, z "
     place += f"{lamps.middle[2]:.2f} ± {wide[2]:.2f} mm"
-    if not GAMMA_RANGE[0] < lamps.gamma < GAMMA_RANGE[1]:
+    if not GAMMA_RANGE[0] <= lamps.gamma <= GAMMA_RANGE[1]:
         raise InputError(
             source,
             f"the response's exponent would be {lamps.gamma:.2f}",
