@@ -14,6 +14,7 @@ is exactly white at distance 1.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -28,12 +29,50 @@ DEFAULT_GAMMA, DEFAULT_MU = 2.2, 2.767
 
 
 @dataclass(frozen=True)
+class MeasuredLamps:
+    """The lamps that a light consists of, and how well their place is known, where it was measured.
+
+    `positions_mm` in camera axes; `shares` of the light, sum 1; `deviation_mm` the standard deviation of the light's
+    position in x, y and z; `lens_mu` how much of the light's mu is the lens's own darkening to the side, which stays
+    with the camera's axis.
+    """
+
+    positions_mm: tuple[tuple[float, float, float], ...]
+    shares: tuple[float, ...]
+    deviation_mm: tuple[float, float, float]
+    lens_mu: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "positions_mm", tuple(tuple(map(float, place)) for place in self.positions_mm))
+        object.__setattr__(self, "shares", tuple(map(float, self.shares)))
+        object.__setattr__(self, "deviation_mm", tuple(map(float, self.deviation_mm)))
+        sizes = [*map(len, self.positions_mm), len(self.deviation_mm)]
+        if not self.positions_mm or set(sizes) != {3} or len(self.shares) != len(self.positions_mm):
+            raise InputError(
+                "lamps",
+                f"{len(self.positions_mm)} positions, {len(self.shares)} shares",
+                "expected a share for each position, and 3 numbers for each position and for the deviation",
+            )
+        numbers = [*np.ravel(self.positions_mm), *self.shares, *self.deviation_mm, self.lens_mu]
+        if not np.isfinite(numbers).all():
+            raise InputError("lamps", "a value is not finite", "expected numbers")
+        if min(self.shares) <= 0 or abs(sum(self.shares) - 1) > 0.01 or min(self.deviation_mm) < 0:
+            raise InputError(
+                "lamps",
+                f"shares {self.shares}, deviation {self.deviation_mm}",
+                "expected shares above 0 whose sum is 1, and deviations of at least 0",
+            )
+
+
+@dataclass(frozen=True)
 class PhotometricCalibration:
     """Light and response of one endoscope. `position_mm` in camera axes; `direction` is normalised at birth.
 
     `reflectance` is the share of light that the wall throws back for others to receive (radiosity's rho).
     `source` says where the numbers come from: measured, fitted (on a sparse map, whose light explains its points best
-    and need not be the endoscope's own), published, given (by somebody who did not say) or assumed.
+    and need not be the endoscope's own), published, given (by somebody who did not say) or assumed. `lamps` is what is
+    known besides of a light whose position was measured: all that computes takes the one light at `position_mm`, the
+    mean of its lamps, which at distances large against their own is the same.
     """
 
     gamma: float = DEFAULT_GAMMA
@@ -43,8 +82,11 @@ class PhotometricCalibration:
     gain: float = 1.0
     reflectance: float = 0.0
     source: str = "assumed"
+    lamps: MeasuredLamps | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.lamps, Mapping):  # of a record that was written as JSON
+            object.__setattr__(self, "lamps", MeasuredLamps(**self.lamps))
         if len(self.position_mm) != 3 or len(self.direction) != 3:
             raise InputError(
                 "light", f"position_mm {self.position_mm}, direction {self.direction}", "expected 3 numbers each"
@@ -75,7 +117,7 @@ class PhotometricCalibration:
 
     def co_located(self) -> PhotometricCalibration:
         """The same light moved to the camera centre and turned along the axis: what an up-to-scale distance can use."""
-        return replace(self, position_mm=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0))
+        return replace(self, position_mm=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0), lamps=None)
 
     def terms(self, dtype: torch.dtype = torch.float32) -> LightTerms:
         """Tensors for one image (batch of 1)."""

@@ -16,6 +16,8 @@ EVALUATE = f"evaluate HERE/predictions --truth {DATA} {OUT}"
 MEASURE = "measure HERE/dense"
 VIEW = "view HERE/dense"
 SCALE = f"scale HERE/dense {OUT}"
+CALIBRATE = f"calibrate-light {DATA} {OUT}"
+BOARD = f"{CALIBRATE} --position charuco --board.squares [9,7] --board.square-mm 4 --board.marker-mm 3"
 
 MORE = [
     # ---- numbers out of range
@@ -210,6 +212,26 @@ MORE = [
     Command(f"calibrate-light {DATA} {OUT} --seed -3", words="--seed: -3"),
     Command(f"calibrate-light HERE/bare {OUT}", words="camera.json"),
     Command(f"calibrate-light HERE/endomapper {OUT}", words="depth"),
+    Command(f"{CALIBRATE} --position", 2, "--position"),
+    Command(f"{CALIBRATE} --position paper", 2, "expected one of charuco, checkerboard"),
+    Command(f"{CALIBRATE} --position charuco", 2, "--board.squares"),
+    Command(f"{CALIBRATE} --position checkerboard --board.squares [9,7]", 2, "--board.square-mm"),
+    Command(f"{CALIBRATE} --position charuco --board.squares [9,7] --board.square-mm 4", 2, "--board.marker-mm"),
+    Command(f"{BOARD} --board.squares [9]", 2, "--board.squares"),
+    Command(f"{BOARD} --board.squares [2,7]", words="--board.squares: [2, 7]"),
+    Command(f"{BOARD} --board.square-mm 0", words="--board.square-mm: 0"),
+    Command(f"{BOARD} --board.square-mm .nan", words="--board.square-mm: nan"),
+    Command(f"{BOARD} --board.marker-mm 9", words="--board.marker-mm: 9"),
+    Command(f"{BOARD} --board.dictionary 4x5", 2, "--board.dictionary"),
+    Command(f"{BOARD} --board.squares [60,60]", words="has 1000 markers"),
+    Command(f"{BOARD} --lamps.number 4", words="--lamps.number: 4"),
+    Command(f"{BOARD} --lamps.gamma 0", words="--lamps.gamma: 0"),
+    Command(f"{BOARD} --map HERE/colmap", words="--position: with --map"),
+    Command(BOARD, words="was found in 0 of"),
+    Command(
+        f"{CALIBRATE} --position checkerboard --board.squares [9,7] --board.square-mm 4", words="was found in 0 of"
+    ),
+    Command(f"{CALIBRATE} --board.square-mm 4", words="without --position"),
     Command(f"convert-camera HERE/nowhere.json {OUT}", words="nowhere.json"),
     Command(f"convert-camera HERE/bad/huge.json {OUT}.json", words="huge.json"),
     Command(f"convert-camera HERE/bad/nan.json {OUT}", words="nan.json"),

@@ -37,6 +37,14 @@ class _CameraFile(BaseModel):
     note: str | None = None
 
 
+class _LampsFile(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    positions_mm: tuple[tuple[float, float, float], ...]
+    shares: tuple[float, ...]
+    deviation_mm: tuple[float, float, float]
+    lens_mu: float = 0.0
+
+
 class _LightFile(BaseModel):
     model_config = ConfigDict(extra="forbid")
     gamma: float = 2.2
@@ -46,6 +54,7 @@ class _LightFile(BaseModel):
     gain: float = 1.0
     reflectance: float = 0.0
     source: Literal["measured", "fitted", "published", "given", "assumed"] = "given"
+    lamps: _LampsFile | None = None  # of a light whose position was measured; earlier versions wrote none
 
 
 def camera_from_fields(data: Any, where: str) -> CameraModel:
@@ -96,4 +105,6 @@ def _light(data: Any, where: str) -> PhotometricCalibration:
 
 
 def write_light_json(light: PhotometricCalibration, path: Path) -> None:
-    write_whole(path, json.dumps(asdict(light), indent=1) + "\n")
+    """light.json. Without lamps it is a file that every version reads."""
+    fields = {name: value for name, value in asdict(light).items() if value is not None}
+    write_whole(path, json.dumps(fields, indent=1) + "\n")

@@ -133,7 +133,7 @@ def read_photometric(path: Path) -> PhotometricCalibration:
 
 
 def write_photometric(light: PhotometricCalibration, path: Path) -> None:
-    """EndoMapper's photometric calibration. It has no place for gain, reflectance and source."""
+    """EndoMapper's photometric calibration. It has no place for gain, reflectance, source and lamps."""
     metres = [v / 1000 for v in light.position_mm]
     write_whole(
         path,

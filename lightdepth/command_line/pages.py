@@ -51,8 +51,10 @@ PAGES = {
     "calibrate-light": Page(
         (
             "lightdepth calibrate-light data/mine --map runs/slam -o light.json",
-            "lightdepth calibrate-light data/c3vd/cecum_t1_a -o light.json",
-        )
+            "lightdepth calibrate-light frames --position charuco --board.squares [9,7] --board.square-mm 4 "
+            "--board.marker-mm 3 -o light.json",
+        ),
+        more=("board.squares", "board.square_mm", "board.marker_mm", "board.dictionary"),
     ),
     "convert-camera": Page(
         (

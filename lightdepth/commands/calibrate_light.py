@@ -1,4 +1,4 @@
-"""The verb calibrate-light: response and spread of an endoscope's light."""
+"""The verb calibrate-light: response, spread and position of an endoscope's light."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from lightdepth.detective.clock import by_the_images
 from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_files
 from lightdepth.files.writing import write_together
+from lightdepth.light.board import Board
+from lightdepth.light.board_page import board_page
+from lightdepth.light.fit_on_board import LampsConfig, PositionConfig, fit_on_board
 from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.light.report import light_page
@@ -36,9 +39,10 @@ def calibrate_light(
     bit_depth: Annotated[int | None, Range(8, 32)] = None,
     seed: Annotated[int, SEED] = 0,
     pairing: Group[PairingConfig] = PairingConfig(),
+    sought: Group[PositionConfig] = PositionConfig(),
     overwrite: bool = False,
 ) -> None:
-    """The light of an endoscope: response and spread, from a sparse map or from frames with known depth.
+    """The light of an endoscope: response and spread, from a map or known depth; its position, from a printed board.
 
     Args:
         data: Folder of frames, or video, whose light is sought.
@@ -66,6 +70,13 @@ def calibrate_light(
     check_files([output, page_path], overwrite, [data, map, camera, mask])
     rng = np.random.default_rng(seed)
     source = SequenceSource(data, format, camera, mask=mask, bit_depth=bit_depth)
+    if sought.position is not None:
+        if map is not None:
+            raise InputError("--position", "with --map", "give one of them: a board's own poses are found on it")
+        _from_board(source, Board.of(sought.position, sought.board), sought.lamps, rng, output)
+        return
+    if sought != PositionConfig():
+        raise InputError("--board, --lamps", "without --position", "say which board it is: --position charuco")
     if map is None:
         fit = fit_on_truth(source.open(), rng)
         what = f"{data}, frames with known depth"
@@ -87,4 +98,25 @@ def calibrate_light(
     print(f"light: {fit.summary()}")
     then = f"lightdepth densify DATA --map MAP --light {quote(str(output))} -o runs/dense"
     result = {"light": plain(fit.light), "errors": fit.errors, "uncertainty": fit.uncertainty, "said": fit.summary()}
+    end(output, page_path, then=then, page=page_path, result=result)
+
+
+def _from_board(
+    source: SequenceSource, board: Board, config: LampsConfig, rng: np.random.Generator, output: Path
+) -> None:
+    """Finds the light's position, and writes it."""
+    page_path = output.with_suffix(".html")
+    found = fit_on_board(source.open(), board, config, rng)
+    page = board_page(found, told(f"{source.data}, frames of {board.name}", data=source.data))
+    write_together({page_path: page.write, output: lambda path: write_light(found.light, path)})
+    print(f"light: {found.summary()}")
+    then = f"lightdepth densify DATA --map MAP --light {quote(str(output))} -o runs/dense"
+    result = {
+        "light": plain(found.light),
+        "interval_mm": plain([[a - w, a + w] for a, w in zip(found.fit.lamps.middle, found.half_width, strict=True)]),
+        "left": found.left,
+        "withheld": plain(found.withheld),
+        "frames": [white.name for white in found.whites],
+        "said": found.summary(),
+    }
     end(output, page_path, then=then, page=page_path, result=result)
