@@ -136,7 +136,7 @@ def joined_section(page: Report, merged: Merged) -> None:
 
 
 def _surfaces(results: Sequence[SubmapResult], merged: Merged | None, errors: Sequence[ErrorMesh]) -> list[Surface]:
-    """The joined surfaces, then those of submaps that are in none of them."""
+    """The joined surfaces, then those of submaps that are in none of them, the green ones first."""
     joined = [] if merged is None else list(zip(merged.results, merged.groups, strict=True))
     joined = [(result, group) for result, group in joined if len(result.dense.triangles)]
     within = {map_id for _, group in joined for map_id in group}
@@ -145,7 +145,8 @@ def _surfaces(results: Sequence[SubmapResult], merged: Merged | None, errors: Se
         surface_of(f"{joined_name(result)}: maps {', '.join(map(str, sorted(group)))} as one", result.dense)
         for result, group in joined
     ]
-    for dense in (r.dense for r in results if r.dense.submap.id not in within):
+    alone = [r for r in results if r.dense.submap.id not in within]
+    for dense in (r.dense for r in sorted(alone, key=lambda r: r.verdict is None or r.verdict.colour != "green")):
         number = dense.submap.id
         surfaces.append(surface_of(f"map {number}", dense, distances.get(f"map_{number:03d}")))
     return surfaces

@@ -15,6 +15,7 @@ from colons import colon, sequence, slam, truth
 from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
 from densify.evaluation.records import ErrorMesh
+from densify.judging.verdict import Verdict
 from densify.page import FILES, Gallery, _surfaces, densify_page
 from densify.pipeline import SubmapResult, densify
 from densify.scene import PICTURES, Thumbnails, scene_of, surface_of
@@ -69,6 +70,17 @@ def test_the_scene_of_a_report_has_the_surfaces_triangles_its_places_and_its_col
     first, confidence = (next(x for x in told["layers"] if x["title"] == t) for t in ("Of the images", "Confidence"))
     assert np.abs(unpacked(first["values"]).reshape(-1, 3) / 255 - dense.colors).max() <= 0.5 / 255 + 1e-6
     assert np.abs(unpacked(confidence["values"]) / 255 - dense.confidence).max() <= 0.5 / 255 + 1e-6
+
+
+def test_the_scene_begins_with_a_green_surface(made):
+    (result, _), judged = made, []
+    for number, colour in enumerate(("red", "amber", "green", "green")):
+        submap = replace(result.dense.submap, id=number)
+        verdict = SimpleNamespace(verdict=Verdict(colour, "as it is"))
+        judged.append(replace(result, dense=replace(result.dense, submap=submap), judgement=verdict, coverage=None))
+    assert [surface.title for surface in _surfaces(judged, None, [])] == ["map 2", "map 3", "map 0", "map 1"]
+    unjudged = [replace(found, judgement=None) for found in judged]
+    assert [surface.title for surface in _surfaces(unjudged, None, [])] == ["map 0", "map 1", "map 2", "map 3"]
 
 
 def test_the_scene_has_the_cameras_of_the_path_the_points_by_kind_and_the_errors_that_are_known(made, tmp_path):
