@@ -403,10 +403,15 @@ def test_the_library_of_the_viewer_is_imported_by_its_verb_alone_when_it_is_call
     )
 
 
+def heeds_ctrl_c() -> None:
+    """What a shell runs in the background ignores SIGINT, and so would the tests' own children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize("words", [["--json"], ["--quiet"]])
 def test_the_verb_says_where_to_look_and_how_from_elsewhere_and_ends_on_ctrl_c(run, words):
     argv = [sys.executable, "-m", "lightdepth", "view", str(run), "--port", "0", *words]
-    aside = {"env": os.environ | {"LIGHTDEPTH_HEARTBEAT": "off"}, "start_new_session": True}
+    aside = {"env": os.environ | {"LIGHTDEPTH_HEARTBEAT": "off"}, "start_new_session": True, "preexec_fn": heeds_ctrl_c}
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **aside) as process:
         said = process.stderr if "--json" in words else process.stdout
         opened, tunnel = said.readline(), said.readline()
@@ -418,7 +423,10 @@ def test_the_verb_says_where_to_look_and_how_from_elsewhere_and_ends_on_ctrl_c(r
             assert {address.ip for address in listening(process.pid)} == {"127.0.0.1"}
         finally:
             process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
+        try:
+            out, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert f" ssh -L {port}:localhost:{port} HOST, then open http://localhost:{port} there\n" in tunnel
     assert process.returncode == 130 and "lightdepth view: stopped by SIGINT; nothing was written" in err
     assert "Traceback" not in err and "viser" not in out + err
