@@ -67,6 +67,7 @@ def test_help_lists_the_verbs_in_the_order_of_the_work_each_with_its_line(capsys
         "predict",
         "sparse",
         "densify",
+        "batch",
         "live",
         "evaluate",
         "bench",

@@ -16,10 +16,12 @@ from lightdepth.signals import SIGNALS, ending_on_signals, finishing_first
 
 @pytest.fixture(autouse=True)
 def heard():
-    """Interrupts are heard, also where the tests themselves run in a shell's background, which ignores them."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Signals are heard, also where the tests themselves run in the background or under nohup, which ignore some."""
+    usual = {n: signal.default_int_handler if n == signal.SIGINT else signal.SIG_DFL for n in SIGNALS}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture
