@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from colons import EXACT, colon, sequence, slam, truth
+from raising import refused
 
 from densify.config import DensifyConfig
 from densify.dense_map import DenseMap
@@ -23,8 +25,6 @@ from lightdepth.camera import Pinhole
 from lightdepth.parallax import ParallaxConfig
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Submap
-from tests.colons import EXACT, colon, sequence, slam, truth
-from tests.raising import refused
 
 COARSE = DensifyConfig(fusion=FusionConfig(voxels_per_distance=15.0))
 CAMERA = Pinhole(160, 128, 86.0, 86.0, 80.0, 64.0)

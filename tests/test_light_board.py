@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from boards import Lamp, Lens, Scene, photograph, turned, write_frames
+from raising import refused
 
 from lightdepth.calibration import read_light, write_light
 from lightdepth.camera import KannalaBrandt, Pinhole
@@ -20,7 +21,6 @@ from lightdepth.light.board import Board, BoardConfig, find_board
 from lightdepth.light.board_pose import Pose, White, board_pose, white_paper
 from lightdepth.light.fit_on_board import LampsConfig, fit_on_board, fit_on_white
 from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
-from tests.raising import refused
 
 PLACE = np.array([2.5, -1.0, -0.5])
 PINHOLE, FISHEYE = Lens(400, 300, 240.0), Lens(400, 300, 240.0, True, -0.05)

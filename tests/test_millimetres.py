@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from raising import refused
 
 from lightdepth.camera import Pinhole
 from lightdepth.light import millimetres as room
@@ -15,7 +16,6 @@ from lightdepth.light.millimetres import Millimetres, millimetres
 from lightdepth.light.shading import fitted
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.tube import render_sequence
-from tests.raising import refused
 
 CAMERA = Pinhole(120, 96, 64.0, 64.0, 60.0, 48.0)
 LIGHT = PhotometricCalibration(2.2, 1.5, (4.0, 1.5, 0.0), reflectance=0.05, source="given")

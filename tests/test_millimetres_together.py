@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from raising import refused
 from test_millimetres import LIGHT, looks, quick  # noqa: F401 - fixtures
 
 from lightdepth.light import millimetres as room
 from lightdepth.light.known_length import BOTH, LENGTH, KnownLength, weighed
 from lightdepth.light.looks import Look
 from lightdepth.light.millimetres import Millimetres, Together, together
-from tests.raising import refused
 
 
 def resized(given: list[Look], factor: float) -> list[Look]:

@@ -37,7 +37,7 @@ MINUTES = (
 )
 """Commands that take minutes: what they do is tested in modules of their own."""
 OTHER_DATA = ("--suite", "calib_results.txt", "--join", "joined_000", "lightdepth select", "--data.frames", "runs/self")
-OTHER_DATA += ("densify DATA", "lightdepth batch")
+OTHER_DATA += ("densify DATA", "lightdepth batch", "calibrate-light BOARD")
 """Commands on data that the colon does not give (its small frames do not match); likewise."""
 
 OPEN_ENDED = ("view",)

@@ -7,12 +7,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from colons import colon, slam, truth
 
 from lightdepth.camera import Pinhole
 from lightdepth.parallax import Look, ParallaxConfig, guessed, measured
 from lightdepth.relative_pose import Tracks, as_the_images_say, fitted, pixels_per_radian
 from lightdepth.sparse_map import Keyframe, Submap
-from tests.colons import colon, slam, truth
 
 CAMERA = Pinhole(160, 128, 86.0, 86.0, 80.0, 64.0)
 CONFIG = ParallaxConfig()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from shlex import quote
 from typing import Annotated
 
 from densify.scale_file import FOLDER
@@ -49,4 +48,4 @@ def scale(
         out.record["maps"] = [asdict(one) for one in found.maps]
         if not found.told:
             out.fail("the scale", f"no map has a figure; {found.maps[0]}")
-    end(folder, then=f"lightdepth measure {quote(str(run))} --points '[[X, Y, Z], [X, Y, Z]]'")
+    end(folder, then="lightdepth measure RUN --points '[[X, Y, Z], [X, Y, Z]]'")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -24,8 +25,10 @@ from lightdepth.light.fit_on_board import LampsConfig, PositionConfig, fit_on_bo
 from lightdepth.light.fit_on_map import fit_on_map
 from lightdepth.light.fit_on_truth import fit_on_truth
 from lightdepth.light.report import light_page
+from lightdepth.photometry import PhotometricCalibration
 from lightdepth.ranges import SEED, Range
 from lightdepth.reporting.names import told
+from lightdepth.reporting.report import Report
 from lightdepth.reporting.same import plain
 
 
@@ -73,50 +76,53 @@ def calibrate_light(
     if sought.position is not None:
         if map is not None:
             raise InputError("--position", "with --map", "give one of them: a board's own poses are found on it")
-        _from_board(source, Board.of(sought.position, sought.board), sought.lamps, rng, output)
-        return
-    if sought != PositionConfig():
+        found = _of_board(source, Board.of(sought.position, sought.board), sought.lamps, rng)
+    elif sought != PositionConfig():
         raise InputError("--board, --lamps", "without --position", "say which board it is: --position charuco")
-    if map is None:
-        fit = fit_on_truth(source.open(), rng)
-        what = f"{data}, frames with known depth"
     else:
-        sparse_map, frames = open_with_map(source, map, pairing)
-        sparse_map = by_the_images(sparse_map, frames)
-        given = frames.first().camera if camera is not None else None
-        check_pairing(sparse_map, frames, pairing, given=given)
-        fit = fit_on_map(frames, sparse_map, camera=given, rng=rng)
-        what = f"{data}, {sparse_map.source}"
-    page = light_page(fit, told(what, data=data, map=map))
-    page.links([(output.name, "the light, for --light of the other verbs")])
-    write_together(
-        {
-            page_path: page.write,
-            output: lambda path: write_light(fit.light, path),
-        }
-    )
-    print(f"light: {fit.summary()}")
+        found = _of_wall(source, map, pairing, rng)
+    found.page.links([(output.name, "the light, for --light of the other verbs")])
+    write_together({page_path: found.page.write, output: lambda path: write_light(found.light, path)})
+    print(f"light: {found.said}")
     then = f"lightdepth densify DATA --map MAP --light {quote(str(output))} -o runs/dense"
-    result = {"light": plain(fit.light), "errors": fit.errors, "uncertainty": fit.uncertainty, "said": fit.summary()}
+    result = {"light": plain(found.light), **found.more, "said": found.said}
     end(output, page_path, then=then, page=page_path, result=result)
 
 
-def _from_board(
-    source: SequenceSource, board: Board, config: LampsConfig, rng: np.random.Generator, output: Path
-) -> None:
-    """Finds the light's position, and writes it."""
-    page_path = output.with_suffix(".html")
+@dataclass(frozen=True)
+class _Found:
+    """A light with what is said of it: in a line, on a page, and to programs besides."""
+
+    light: PhotometricCalibration
+    said: str
+    page: Report
+    more: dict[str, object]
+
+
+def _of_wall(source: SequenceSource, map: Path | None, pairing: PairingConfig, rng: np.random.Generator) -> _Found:
+    """By the wall itself, whose distance the map or the truth tells."""
+    if map is None:
+        fit = fit_on_truth(source.open(), rng)
+        what = f"{source.data}, frames with known depth"
+    else:
+        sparse_map, frames = open_with_map(source, map, pairing)
+        sparse_map = by_the_images(sparse_map, frames)
+        given = frames.first().camera if source.camera is not None else None
+        check_pairing(sparse_map, frames, pairing, given=given)
+        fit = fit_on_map(frames, sparse_map, camera=given, rng=rng)
+        what = f"{source.data}, {sparse_map.source}"
+    page = light_page(fit, told(what, data=source.data, map=map))
+    return _Found(fit.light, fit.summary(), page, {"errors": fit.errors, "uncertainty": fit.uncertainty})
+
+
+def _of_board(source: SequenceSource, board: Board, config: LampsConfig, rng: np.random.Generator) -> _Found:
+    """By a printed board, with the light's position."""
     found = fit_on_board(source.open(), board, config, rng)
     page = board_page(found, told(f"{source.data}, frames of {board.name}", data=source.data))
-    write_together({page_path: page.write, output: lambda path: write_light(found.light, path)})
-    print(f"light: {found.summary()}")
-    then = f"lightdepth densify DATA --map MAP --light {quote(str(output))} -o runs/dense"
-    result = {
-        "light": plain(found.light),
+    more = {
         "interval_mm": plain([[a - w, a + w] for a, w in zip(found.fit.lamps.middle, found.half_width, strict=True)]),
         "left": found.left,
         "withheld": plain(found.withheld),
         "frames": [white.name for white in found.whites],
-        "said": found.summary(),
     }
-    end(output, page_path, then=then, page=page_path, result=result)
+    return _Found(found.light, found.summary(), page, more)
