@@ -24,6 +24,7 @@ def data(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_two_processes_make_what_densify_makes_of_each_to_the_last_bit(data, tmp_path):
     assert batch(f"{data}/case_0[01]", tmp_path / "out", "--jobs", "2", "--formats", "[ply, obj]") == 0
     runs = {int(name["frames"]): tmp_path / "out" / "sequences" / name["sequence"] for name in table(tmp_path / "out")}
