@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from densify.evaluation.records import MapFigures, SurfaceFigures
-from densify.judging.verdict import Verdict
+from densify.judging.verdict import COLOURS, Verdict
 from lightdepth.sparse_map import SparseMap
 from lightdepth.tube.map_errors import MapErrors, moved_ids, with_errors
 
 SIDE = 0.4
 """Share of the submap's points that are too far away."""
-_ORDER = ("green", "amber", "red")
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,9 @@ def _off(figures: MapFigures) -> str:
 def _order(verdicts: Mapping[int, Verdict | None], errors: Mapping[int, SurfaceFigures | None]) -> str:
     """Whether the worse colours are on the worse surfaces."""
     both = [(v, e) for i, v in verdicts.items() if v is not None and (e := errors.get(i)) is not None]
-    pairs = [((_ORDER.index(a.colour), x.rms_mm), (_ORDER.index(b.colour), y.rms_mm)) for a, x in both for b, y in both]
+    pairs = [
+        ((COLOURS.index(a.colour), x.rms_mm), (COLOURS.index(b.colour), y.rms_mm)) for a, x in both for b, y in both
+    ]
     apart = [(x < y) for (a, x), (b, y) in pairs if a < b]
     if not apart:
         return ": the colours do not tell them apart" if len(both) > 1 else ""

@@ -104,7 +104,7 @@ class ScaleAsked:
         frames, missing = run_frames(self.run, self.data, record)
         if frames is None:
             raise InputError(self.run, missing, "give them: --data FRAMES")
-        named = self.light or _light_of(record)
+        named = self.light or _light_of(self.run, record)
         light = frames.first().light if named is None else read_light(named)
         return scales_of(self.maps, frames, light, self.wall_mm, self.length), light
 
@@ -123,8 +123,13 @@ def _seen(folder: Path) -> SeenMap | None:
     return SeenMap(dense.id, Surface(dense.vertices, dense.triangles), keyframes)
 
 
-def _light_of(record: Mapping[str, object]) -> str | None:
-    """The light that a run was given, where it still is; None where it was given none."""
+def _light_of(run: Path, record: Mapping[str, object]) -> str | None:
+    """The light that a run was given; None where it was given none. Raises InputError where it is no longer there:
+    under another light the figure would be another one."""
     arguments = record.get("arguments")
     named = arguments.get("light") if isinstance(arguments, Mapping) else None
-    return named if isinstance(named, str) and ("=" in named or Path(named).is_file()) else None
+    if named is None:
+        return None
+    if not isinstance(named, str) or ("=" not in named and not Path(named).is_file()):
+        raise InputError(run, f"the light that it was made under is not found ({named})", "give it: --light")
+    return named

@@ -169,6 +169,17 @@ def test_an_area_goes_with_the_square_of_the_scale(made, told, capsys):
     assert result["intervals"]["outline"] is None
 
 
+def test_a_run_whose_light_is_gone_is_told_by_no_other_light(made, told, capsys):
+    told(figure(2.0), figure(3.0))
+    record = json.loads((made / "run.json").read_text())
+    record["arguments"]["light"] = str(made.parent / "gone.json")
+    (made / "run.json").write_text(json.dumps(record))
+    assert main(["scale", str(made)]) == 3
+    assert "the light that it was made under is not found" in capsys.readouterr().err
+    assert not (made / "scale").exists()
+    assert main(["scale", str(made), "--light", "gamma=2.2,mu=0"]) == 0
+
+
 def test_where_every_map_is_refused_it_is_4_and_no_figure_stands_anywhere(made, told, capsys):
     told(figure(2.345, FLAT), figure(2.345, FLAT))
     assert main(["scale", str(made)]) == 4

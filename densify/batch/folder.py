@@ -13,7 +13,7 @@ import json
 import os
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -40,34 +40,16 @@ _PATIENCE_S = 120.0
 def in_turn(output: Path) -> Iterator[None]:
     """Within it nobody else writes to the files of the output, but to the runs in it. Waits for others."""
     until = time.monotonic() + _PATIENCE_S
-    while True:
-        try:
-            with _entered(output):
-                yield
-            return
-        except _NotYet as error:
-            if time.monotonic() > until:
-                raise error.why from None
-        time.sleep(0.2)
-
-
-class _NotYet(Exception):
-    def __init__(self, why: InUse) -> None:
-        super().__init__(str(why))
-        self.why = why
-
-
-@contextmanager
-def _entered(output: Path) -> Iterator[None]:
-    holding = locked(output)
-    try:
-        holding.__enter__()
-    except InUse as error:
-        raise _NotYet(error) from error
-    try:
+    with ExitStack() as holding:
+        while True:
+            try:
+                holding.enter_context(locked(output))
+                break
+            except InUse:
+                if time.monotonic() > until:
+                    raise
+            time.sleep(0.2)
         yield
-    finally:
-        holding.__exit__(None, None, None)
 
 
 def real_place(output: Path) -> Path:

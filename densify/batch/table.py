@@ -13,6 +13,7 @@ from pathlib import Path
 from densify.batch.folder import PAGE, TABLE, TABLE_JSON
 from densify.batch.make import SEQUENCES, Ended
 from densify.batch.units import Unit
+from densify.judging.verdict import COLOURS
 from lightdepth.counting import counted
 from lightdepth.files.replacing import read_record
 from lightdepth.files.writing import write_together, write_whole
@@ -22,7 +23,6 @@ from lightdepth.reporting.report import Report
 
 STATES = ("done", "in part", "failed", "elsewhere", "waiting")
 _COUNTED = ("keyframes", "aligned", "vertices")
-COLOURS = ("green", "amber", "red")
 _FILES = {
     TABLE: "the table for spreadsheets",
     TABLE_JSON: "the same for programs",

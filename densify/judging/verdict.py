@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from densify.judging.doubts import Doubts
 from densify.judging.withheld import Withheld
 
 Colour = Literal["green", "amber", "red"]
+COLOURS: tuple[Colour, ...] = get_args(Colour)
+"""From the best to the worst."""
 Asked = Literal["", "images", "map"]
 """Who a verdict's number is from: the images' parallax, or the map's own points where the images are silent."""
 
@@ -145,8 +147,7 @@ def proposal(j: Judgement) -> str:
 
 def worst(verdicts: Sequence[Verdict]) -> Verdict | None:
     """The verdict on a run: the worst of its submaps', of equal colours the one with the larger number."""
-    order = ("green", "amber", "red")
-    return max(verdicts, key=lambda v: (order.index(v.colour), v.number), default=None)
+    return max(verdicts, key=lambda v: (COLOURS.index(v.colour), v.number), default=None)
 
 
 def headline(verdicts: Mapping[int, Verdict], doubts: Sequence[str] = ()) -> str:
