@@ -4,7 +4,7 @@
 
 Forty runs on colons 950-955 (lenses c3vd, fisheye, pinhole in turn, every second colon of the realistic family), none
 of which anything was tuned on: 100 frames of 160x128 over 30 mm, one submap of a simulated SLAM that errs as a real one
-(lightdepth.tube.slam), with the closed form or a bundled network. What is green, amber and red in truth was fixed
+(lightdepth.tube.slam), with the closed form or the default network. What is green, amber and red in truth was fixed
 before the first run: with e the median of |surface - truth| / truth along the rays of the keyframes where they truly
 stood, the trajectories brought together by a similarity, and e_1 that of the same with one scale a keyframe,
 
@@ -32,7 +32,7 @@ from densify.config import DensifyConfig
 from densify.judging.config import JudgeConfig
 from densify.pipeline import SubmapResult, densify_submap
 from densify.similarity import umeyama
-from lightdepth.checkpoint import load_model
+from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_model
 from lightdepth.datasets import FrameSequence
 from lightdepth.detective import investigate
 from lightdepth.frame import Frame
@@ -47,7 +47,7 @@ LENSES = ("c3vd", "fisheye", "pinhole")
 FULL = DensifyConfig()
 SCALED = replace(FULL.rigid(), judge=JudgeConfig(on=False))
 UNBRAKED = replace(FULL, judge=JudgeConfig(on=False))
-SELF, CLOSED = "lightdepth-self", "decline"
+DEFAULT, CLOSED = DEFAULT_CHECKPOINT, "decline"
 
 
 NO_ERRORS = MapErrors()
@@ -77,26 +77,26 @@ def side(share: float, factor: float) -> MapErrors:
 
 
 CASES = (
-    *(Case(i, m, "clean") for i, m in ((0, SELF), (1, CLOSED), (2, SELF), (3, SELF), (4, CLOSED), (5, SELF))),
+    *(Case(i, m, "clean") for i, m in ((0, DEFAULT), (1, CLOSED), (2, DEFAULT), (3, DEFAULT), (4, CLOSED), (5, DEFAULT))),
     *(Case(i, m, f"side 30 % x{f}", side(0.3, f)) for f, (i, m) in zip(
-        (1.05, 1.1, 1.15, 1.3, 1.5, 1.1, 1.15, 1.3, 1.5), ((0, SELF), (1, SELF), (2, CLOSED), (3, CLOSED), (4, SELF),
-        (5, CLOSED), (0, CLOSED), (1, CLOSED), (2, SELF)), strict=True)),
+        (1.05, 1.1, 1.15, 1.3, 1.5, 1.1, 1.15, 1.3, 1.5), ((0, DEFAULT), (1, DEFAULT), (2, CLOSED), (3, CLOSED), (4, DEFAULT),
+        (5, CLOSED), (0, CLOSED), (1, CLOSED), (2, DEFAULT)), strict=True)),
     *(Case(i, m, f"side 45 % x{f}", side(0.45, f)) for f, (i, m) in zip(
-        (1.1, 1.15, 1.3, 1.5, 1.3, 1.15), ((3, SELF), (4, SELF), (5, SELF), (0, SELF), (1, CLOSED), (2, CLOSED)),
+        (1.1, 1.15, 1.3, 1.5, 1.3, 1.15), ((3, DEFAULT), (4, DEFAULT), (5, DEFAULT), (0, DEFAULT), (1, CLOSED), (2, CLOSED)),
         strict=True)),
-    *(Case(i, m, "fold 20 %", MapErrors(fold_share=0.2)) for i, m in ((3, SELF), (4, CLOSED))),
-    *(Case(i, m, "poses drift", MapErrors(pose_drift=0.1, pose_drift_deg=5.0)) for i, m in ((5, SELF), (0, SELF))),
+    *(Case(i, m, "fold 20 %", MapErrors(fold_share=0.2)) for i, m in ((3, DEFAULT), (4, CLOSED))),
+    *(Case(i, m, "poses drift", MapErrors(pose_drift=0.1, pose_drift_deg=5.0)) for i, m in ((5, DEFAULT), (0, DEFAULT))),
     *(Case(i, m, "poses drift, points follow", MapErrors(pose_drift=0.1, pose_drift_deg=5.0, points_follow=True))
-      for i, m in ((1, SELF), (2, SELF))),
-    *(Case(i, m, "30 % independent", independent=True) for i, m in ((3, CLOSED), (4, SELF))),
-    *(Case(i, m, "few points", few=True) for i, m in ((5, CLOSED), (0, SELF))),
-    *(Case(i, m, "two frames late", late=2) for i, m in ((1, SELF), (3, SELF))),
-    *(Case(i, m, "ten frames late", late=10) for i, m in ((2, SELF), (4, SELF))),
+      for i, m in ((1, DEFAULT), (2, DEFAULT))),
+    *(Case(i, m, "30 % independent", independent=True) for i, m in ((3, CLOSED), (4, DEFAULT))),
+    *(Case(i, m, "few points", few=True) for i, m in ((5, CLOSED), (0, DEFAULT))),
+    *(Case(i, m, "two frames late", late=2) for i, m in ((1, DEFAULT), (3, DEFAULT))),
+    *(Case(i, m, "ten frames late", late=10) for i, m in ((2, DEFAULT), (4, DEFAULT))),
     *(Case(i, m, "light of gamma 5", gamma=5.0) for i, m in ((5, CLOSED), (0, CLOSED))),
-    *(Case(i, m, "white frames", white=True) for i, m in ((1, SELF), (2, CLOSED))),
+    *(Case(i, m, "white frames", white=True) for i, m in ((1, DEFAULT), (2, CLOSED))),
     Case(3, "constant", "constant distance"),
 )  # fmt: skip
-APART = tuple(Case(i, SELF, "scale drift 1.3", MapErrors(drift=1.3)) for i in (0, 1, 2, 3))
+APART = tuple(Case(i, DEFAULT, "scale drift 1.3", MapErrors(drift=1.3)) for i in (0, 1, 2, 3))
 
 
 @cache
