@@ -14,7 +14,7 @@ from lightdepth.light.enclosure import Enclosure, enclosure
 from lightdepth.light.looks import Look, Seen, elements, seen_places, typical_distance
 from lightdepth.light.millimetres import Millimetres, millimetres
 from lightdepth.light.shading import fitted
-from lightdepth.photometry import PhotometricCalibration
+from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
 from lightdepth.tube import render_sequence
 
 CAMERA = Pinhole(120, 96, 64.0, 64.0, 60.0, 48.0)
@@ -146,6 +146,19 @@ def test_the_light_s_offset_tells_the_millimetres_of_a_map_unit(looks):
     assert 0 < found.deviation < 0.25 and found.views > 500
     low, high = found.interval
     assert low < 2.0 < high and low * high == pytest.approx(found.mm_per_unit**2)
+
+
+def test_what_a_board_says_of_the_lens_s_share_of_mu_is_taken_and_the_interval_is_no_wider_for_it():
+    own, dark = 2.0, np.exp(-2.0 * (1 - rays()[..., 2:]))  # the lens darkens to its side, wherever the lamp sits
+    looks = [replace(look, image=(look.image**2.2 * dark) ** (1 / 2.2)) for look in looks_under(LIGHT, 2.0)]
+    light = replace(LIGHT, mu=LIGHT.mu + own)
+    measured = MeasuredLamps((LIGHT.position_mm,), (1.0,), (0.1, 0.1, 0.1), own)
+    known = millimetres(looks, replace(light, lamps=measured), near=2.5)
+    unsaid = millimetres(looks, light, near=2.5)
+    none_of_it = millimetres(looks, replace(light, lamps=replace(measured, lens_mu=0.0)), near=2.5)
+    assert known.mm_per_unit == pytest.approx(2.0, rel=0.1) and not known.refused
+    assert unsaid.mm_per_unit == pytest.approx(none_of_it.mm_per_unit) and unsaid.deviation > none_of_it.deviation
+    assert abs(np.log(known.mm_per_unit / 2)) < abs(np.log(none_of_it.mm_per_unit / 2))
 
 
 def test_an_offset_too_small_to_be_seen_tells_nothing():

@@ -22,8 +22,8 @@ _ABSOLUTE, _ROUNDS = 4, 5
 
 @dataclass(frozen=True)
 class Shading:
-    """Poses (i, 4, 4) of looks, the places that they see, the wall around these, the light, and which share of its
-    spread is the lens's."""
+    """Poses (i, 4, 4) of looks, the places that they see, the wall around these, the light, and how much of its mu is
+    the lens's."""
 
     poses: np.ndarray
     seen: Seen
@@ -129,14 +129,14 @@ def _lit(
     scale: float,
     lens: float,
 ) -> np.ndarray:
-    """Direct light (n,) on places in the map from a camera's pose, a share of whose spread is the lens's."""
+    """Direct light (n,) on places in the map from a camera's pose; `lens` is how much of its mu is the lens's."""
     at = points @ pose[:3, :3].T + pose[:3, 3]
     reach = np.linalg.norm(at, axis=1)
     terms = light.terms(torch.float64)
-    terms = terms._replace(position=terms.position / scale, mu=terms.mu * (1 - lens))
+    terms = terms._replace(position=terms.position / scale, mu=terms.mu - lens)
     turned, rays = (_batch(v.T)[:, :, None] for v in (normals @ pose[:3, :3].T, at / reach[:, None]))
     lit = irradiance(_batch(reach)[:, None, None], turned, rays, terms)
-    result: np.ndarray = lit.numpy().ravel() * np.exp(-lens * light.mu * (1 - at[:, 2] / reach))
+    result: np.ndarray = lit.numpy().ravel() * np.exp(-lens * (1 - at[:, 2] / reach))
     return result
 
 
