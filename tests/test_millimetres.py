@@ -13,7 +13,7 @@ from lightdepth.light import millimetres as room
 from lightdepth.light.enclosure import Enclosure, enclosure
 from lightdepth.light.looks import Look, Seen, elements, seen_places, typical_distance
 from lightdepth.light.millimetres import Millimetres, millimetres
-from lightdepth.light.shading import fitted
+from lightdepth.light.shading import _lit, fitted
 from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
 from lightdepth.tube import render_sequence
 
@@ -159,6 +159,19 @@ def test_what_a_board_says_of_the_lens_s_share_of_mu_is_taken_and_the_interval_i
     assert known.mm_per_unit == pytest.approx(2.0, rel=0.1) and not known.refused
     assert unsaid.mm_per_unit == pytest.approx(none_of_it.mm_per_unit) and unsaid.deviation > none_of_it.deviation
     assert abs(np.log(known.mm_per_unit / 2)) < abs(np.log(none_of_it.mm_per_unit / 2))
+
+
+def test_each_of_several_lamps_lights_from_its_own_place(looks):
+    sides = ((4.0, 1.5, 0.0), (-4.0, 1.5, 0.0))
+    lamps = MeasuredLamps(sides, (0.25, 0.75), (0.1, 0.1, 0.1))
+    light = replace(LIGHT, position_mm=(-2.0, 1.5, 0.0), lamps=lamps)
+    at, turned = np.array([[1.0, 2.0, 20.0], [-5.0, 0.0, 15.0]]), np.array([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8]])
+    both = _lit(at, turned, np.eye(4), light, 2.0, 0.0)
+    each = [_lit(at, turned, np.eye(4), replace(LIGHT, position_mm=place), 2.0, 0.0) for place in sides]
+    np.testing.assert_allclose(both, 0.25 * each[0] + 0.75 * each[1])
+    # Lamps of the light's mean place are no such pair: the images put them elsewhere, or tell another scale.
+    alone = millimetres(looks, light, near=2.5)
+    assert alone.refused or abs(np.log(alone.mm_per_unit / 2)) > 0.1
 
 
 def test_an_offset_too_small_to_be_seen_tells_nothing():

@@ -7,8 +7,9 @@ light's position, mm, D its direction, l = (X - P/s) / |X - P/s|; E the light th
 
     E(s, rho, b) = exp(-mu (1 - D · l)) (n · -l) / |X - P/s|²  +  E_ind(rho, b)
 
-with the light E_ind that comes by way of other wall, of reflectance rho, of which a share b counts where no look shows
-it (lightdepth.light.enclosure). Over views i of places m, with L the light that comes back (lightdepth.light.looks),
+(the first term is a sum, by their shares, over several lamps that were measured) with the light E_ind that comes by way
+of other wall, of reflectance rho, of which a share b counts where no look shows it (lightdepth.light.enclosure). Over
+views i of places m, with L the light that comes back (lightdepth.light.looks),
 
     log L_im = log g_i + log a_m + log E_im(s, rho, b) + noise,
 
