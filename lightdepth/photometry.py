@@ -71,8 +71,8 @@ class PhotometricCalibration:
     `reflectance` is the share of light that the wall throws back for others to receive (radiosity's rho).
     `source` says where the numbers come from: measured, fitted (on a sparse map, whose light explains its points best
     and need not be the endoscope's own), published, given (by somebody who did not say) or assumed. `lamps` is what is
-    known besides of a light whose position was measured: all that computes takes the one light at `position_mm`, the
-    mean of its lamps, which at distances large against their own is the same.
+    known besides of a light whose position was measured: only what looks for millimetres takes each lamp, all else the
+    one light at `position_mm`, the mean of its lamps, which at distances large against their own is the same.
     """
 
     gamma: float = DEFAULT_GAMMA

@@ -148,6 +148,9 @@ def test_the_light_file_of_one_narrow_lamp_is_that_lamp():
     light = measured_light((Lamp((2.0, 0.0, -0.5), (0.0, 0.0, 1.0), 1.0, 2.5),), rays, 0.0, 2.2)
     assert light.position_mm == (2.0, 0.0, -0.5) and 2.3 < light.mu < 3.1
     wide = measured_light((Lamp((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0, 0.0),), rays, 0.0, 2.2)
+    dark = measured_light((Lamp((2.0, 0.0, -0.5), (0.0, 0.0, 1.0), 1.0, 2.5),), rays, 1.0, 2.2)
+    assert light.lamps is not None and light.lamps.lens_mu == 0
+    assert dark.lamps is not None and dark.lamps.lens_mu == pytest.approx(dark.mu - light.mu) and dark.mu > light.mu
     assert wide.mu < 0.01 < vignetting(rays, 1.0).min()
 
 
@@ -206,7 +209,8 @@ def test_the_judge_knows_nothing_of_what_trains():
     for path in folder.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module == "lightdepth.photometry":
-                assert [alias.name for alias in node.names] == ["PhotometricCalibration"], path.name
+                named = {alias.name for alias in node.names}
+                assert named <= {"PhotometricCalibration", "MeasuredLamps"}, path.name  # what a light file holds
 
 
 @pytest.mark.parametrize("corruption", CORRUPTIONS)

@@ -13,8 +13,8 @@ from lightdepth.light import millimetres as room
 from lightdepth.light.enclosure import Enclosure, enclosure
 from lightdepth.light.looks import Look, Seen, elements, seen_places, typical_distance
 from lightdepth.light.millimetres import Millimetres, millimetres
-from lightdepth.light.shading import fitted
-from lightdepth.photometry import PhotometricCalibration
+from lightdepth.light.shading import _lit, fitted
+from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
 from lightdepth.tube import render_sequence
 
 CAMERA = Pinhole(120, 96, 64.0, 64.0, 60.0, 48.0)
@@ -146,6 +146,32 @@ def test_the_light_s_offset_tells_the_millimetres_of_a_map_unit(looks):
     assert 0 < found.deviation < 0.25 and found.views > 500
     low, high = found.interval
     assert low < 2.0 < high and low * high == pytest.approx(found.mm_per_unit**2)
+
+
+def test_what_a_board_says_of_the_lens_s_share_of_mu_is_taken_and_the_interval_is_no_wider_for_it():
+    own, dark = 2.0, np.exp(-2.0 * (1 - rays()[..., 2:]))  # the lens darkens to its side, wherever the lamp sits
+    looks = [replace(look, image=(look.image**2.2 * dark) ** (1 / 2.2)) for look in looks_under(LIGHT, 2.0)]
+    light = replace(LIGHT, mu=LIGHT.mu + own)
+    measured = MeasuredLamps((LIGHT.position_mm,), (1.0,), (0.1, 0.1, 0.1), own)
+    known = millimetres(looks, replace(light, lamps=measured), near=2.5)
+    unsaid = millimetres(looks, light, near=2.5)
+    none_of_it = millimetres(looks, replace(light, lamps=replace(measured, lens_mu=0.0)), near=2.5)
+    assert known.mm_per_unit == pytest.approx(2.0, rel=0.1) and not known.refused
+    assert unsaid.mm_per_unit == pytest.approx(none_of_it.mm_per_unit) and unsaid.deviation > none_of_it.deviation
+    assert abs(np.log(known.mm_per_unit / 2)) < abs(np.log(none_of_it.mm_per_unit / 2))
+
+
+def test_each_of_several_lamps_lights_from_its_own_place(looks):
+    sides = ((4.0, 1.5, 0.0), (-4.0, 1.5, 0.0))
+    lamps = MeasuredLamps(sides, (0.25, 0.75), (0.1, 0.1, 0.1))
+    light = replace(LIGHT, position_mm=(-2.0, 1.5, 0.0), lamps=lamps)
+    at, turned = np.array([[1.0, 2.0, 20.0], [-5.0, 0.0, 15.0]]), np.array([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8]])
+    both = _lit(at, turned, np.eye(4), light, 2.0, 0.0)
+    each = [_lit(at, turned, np.eye(4), replace(LIGHT, position_mm=place), 2.0, 0.0) for place in sides]
+    np.testing.assert_allclose(both, 0.25 * each[0] + 0.75 * each[1])
+    # Lamps of the light's mean place are no such pair: the images put them elsewhere, or tell another scale.
+    alone = millimetres(looks, light, near=2.5)
+    assert alone.refused or abs(np.log(alone.mm_per_unit / 2)) > 0.1
 
 
 def test_an_offset_too_small_to_be_seen_tells_nothing():

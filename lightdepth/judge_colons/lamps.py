@@ -2,7 +2,8 @@
 
 A lamp at P that points along D shines with intensity I max(D · l, 0)^k in the unit direction l. A lens takes light from
 the side away, by cos^v of the angle from its axis (vignetting). The house's light file knows one source, which fades by
-exp(-mu (1 - D · l)); what is written is the nearest such to all lamps and the lens together, on a wall 30 mm away.
+exp(-mu (1 - D · l)); what is written is the nearest such to all lamps and the lens together, on a wall 30 mm away, and
+how much of it is the lens's.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lightdepth.photometry import PhotometricCalibration
+from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
 
 _MEASURED_AT_MM = 30.0
 
@@ -62,27 +63,38 @@ def measured_light(lamps: Sequence[Lamp], rays: np.ndarray, vignette: float, gam
     direction = shares @ np.array([lamp.direction for lamp in lamps])
     direction = direction / np.linalg.norm(direction)
     points = _MEASURED_AT_MM * rays
-    seen = vignetting(rays, vignette) * sum(
+    lit = sum(
         (lamp.shone(_towards(points, lamp.position)) / np.square(points - lamp.position).sum(-1) for lamp in lamps),
         np.zeros(len(rays)),
     )
-    towards = _towards(points, position)
-    log = np.log(np.maximum(seen * np.square(points - position).sum(-1), 1e-6))
-    away = 1 - towards @ direction
-    weight = np.exp(log) / np.exp(log).sum()  # who measures sees what is bright
-
-    def off(mu: float) -> float:
-        left = log + mu * away
-        return float((weight * np.square(left - weight @ left)).sum())
-
-    mu = float(minimize_scalar(off, bounds=(0.0, 12.0), method="bounded").x)
+    away = 1 - _towards(points, position) @ direction
+    bare = np.asarray(lit) * np.square(points - position).sum(-1)
+    mu = _spread(vignetting(rays, vignette) * bare, away)
     return PhotometricCalibration(
         gamma=gamma,
         mu=round(mu, 4),
         position_mm=_rounded(position),
         direction=_rounded(direction),
         source="measured",
+        lamps=MeasuredLamps(
+            tuple(lamp.position for lamp in lamps),
+            tuple(shares.tolist()),
+            (0.0, 0.0, 0.0),
+            round(mu - _spread(bare, away), 4),
+        ),
     )
+
+
+def _spread(seen: np.ndarray, away: np.ndarray) -> float:
+    """The mu of brightness (n,), times the square of the distance, at directions that are `away` (n,) from the axis."""
+    log = np.log(np.maximum(seen, 1e-6))
+    weight = np.exp(log) / np.exp(log).sum()  # who measures sees what is bright
+
+    def off(mu: float) -> float:
+        left = log + mu * away
+        return float((weight * np.square(left - weight @ left)).sum())
+
+    return float(minimize_scalar(off, bounds=(0.0, 12.0), method="bounded").x)
 
 
 def _rounded(vector: np.ndarray) -> tuple[float, float, float]:

@@ -7,8 +7,9 @@ light's position, mm, D its direction, l = (X - P/s) / |X - P/s|; E the light th
 
     E(s, rho, b) = exp(-mu (1 - D · l)) (n · -l) / |X - P/s|²  +  E_ind(rho, b)
 
-with the light E_ind that comes by way of other wall, of reflectance rho, of which a share b counts where no look shows
-it (lightdepth.light.enclosure). Over views i of places m, with L the light that comes back (lightdepth.light.looks),
+(the first term is a sum, by their shares, over several lamps that were measured) with the light E_ind that comes by way
+of other wall, of reflectance rho, of which a share b counts where no look shows it (lightdepth.light.enclosure). Over
+views i of places m, with L the light that comes back (lightdepth.light.looks),
 
     log L_im = log g_i + log a_m + log E_im(s, rho, b) + noise,
 
@@ -18,8 +19,9 @@ as a function of s, is least at the right scale; where the offset is too small t
 said. Blocks of wall and looks are drawn anew, and the least cost found again over s, rho and b: that is the interval.
 Maps of one procedure have one rho and one b: their costs are added, and each has its s.
 
-A light file's mu does not say which share of it is the lens's (vignetting, about the camera's axis) and does not move
-with P. It is taken for the lamp's alone; what the scale would change by if half were the lens's is in the interval.
+A part of a light file's mu is the lens's (vignetting, about the camera's axis) and does not move with P. A light that
+was measured on a board says how much. Else all is taken for the lamp's, and what the scale would change by if half were
+the lens's is in the interval.
 """
 
 from __future__ import annotations
@@ -157,10 +159,13 @@ class _Placed:
     typical: float
 
     def by_the_lens(self, scales: np.ndarray, reflectance: float, unseen: float) -> float:
-        """Half of what log scale changes by where a part of the light's spread is the lens's."""
+        """Half of what log scale changes by where a part of the light's spread is the lens's; 0 where that is known."""
+        light = self.shading.light
+        if light.lamps is not None:
+            return 0.0
         through = [
             _least(scales, replace(self.shading, lens=lens).losses(scales, (reflectance,), (unseen,)).sum((1, 2, 3, 4)))
-            for lens in (0.0, _LENS)
+            for lens in (0.0, _LENS * light.mu)
         ]
         return float(0.5 * np.log(through[1] / through[0]))
 
@@ -176,7 +181,8 @@ def _place(looks: Sequence[Look], light: PhotometricCalibration, rng: np.random.
         why = f"{views} views of places are even, coloured, and neither white, dark nor steep, of {_LEAST_VIEWS} needed"
         return _untold(why, views)
     around = enclosure(looks, walls, elements(walls, _CELL * typical), seen, typical, rng)
-    return _Placed(Shading(np.stack([look.cam_from_map for look in looks]), seen, around, light), views, typical)
+    poses, lens = np.stack([look.cam_from_map for look in looks]), 0.0 if light.lamps is None else light.lamps.lens_mu
+    return _Placed(Shading(poses, seen, around, light, lens), views, typical)
 
 
 def _solved(

@@ -22,8 +22,8 @@ _ABSOLUTE, _ROUNDS = 4, 5
 
 @dataclass(frozen=True)
 class Shading:
-    """Poses (i, 4, 4) of looks, the places that they see, the wall around these, the light, and which share of its
-    spread is the lens's."""
+    """Poses (i, 4, 4) of looks, the places that they see, the wall around these, the light, and how much of its mu is
+    the lens's."""
 
     poses: np.ndarray
     seen: Seen
@@ -59,8 +59,7 @@ class Shading:
         """Where the images put the light around the axis (tangent of the angle from its place), and by what share they
         have the exponent of the response too large."""
         known, deviation = self._deviation()
-        x, y, z = self.light.position_mm
-        turned = replace(self, light=replace(self.light, position_mm=(x - 0.1 * y, y + 0.1 * x, z)))
+        turned = replace(self, light=_turned(self.light))
         logs = []
         for shading in (self, turned):
             direct, source = shading._direct(scale)
@@ -129,15 +128,32 @@ def _lit(
     scale: float,
     lens: float,
 ) -> np.ndarray:
-    """Direct light (n,) on places in the map from a camera's pose, a share of whose spread is the lens's."""
+    """Direct light (n,) on places in the map from a camera's pose; `lens` is how much of its mu is the lens's."""
     at = points @ pose[:3, :3].T + pose[:3, 3]
     reach = np.linalg.norm(at, axis=1)
     terms = light.terms(torch.float64)
-    terms = terms._replace(position=terms.position / scale, mu=terms.mu * (1 - lens))
+    terms = terms._replace(mu=terms.mu - lens)
     turned, rays = (_batch(v.T)[:, :, None] for v in (normals @ pose[:3, :3].T, at / reach[:, None]))
-    lit = irradiance(_batch(reach)[:, None, None], turned, rays, terms)
-    result: np.ndarray = lit.numpy().ravel() * np.exp(-lens * light.mu * (1 - at[:, 2] / reach))
+    places, shares = (
+        ((light.position_mm,), (1.0,)) if light.lamps is None else (light.lamps.positions_mm, light.lamps.shares)
+    )
+    lit = np.zeros(len(points))
+    for place, share in zip(places, shares, strict=True):
+        own = terms._replace(position=torch.tensor(place, dtype=torch.float64).reshape(1, 3, 1, 1) / scale)
+        lit += share * irradiance(_batch(reach)[:, None, None], turned, rays, own).numpy().ravel()
+    result: np.ndarray = lit * np.exp(-lens * (1 - at[:, 2] / reach))
     return result
+
+
+def _turned(light: PhotometricCalibration) -> PhotometricCalibration:
+    """Turned around the camera's axis, so that each lamp moves by a tenth of its distance from it."""
+
+    def moved(place: tuple[float, float, float]) -> tuple[float, float, float]:
+        x, y, z = place
+        return x - 0.1 * y, y + 0.1 * x, z
+
+    lamps = light.lamps and replace(light.lamps, positions_mm=tuple(map(moved, light.lamps.positions_mm)))
+    return replace(light, position_mm=moved(light.position_mm), lamps=lamps)
 
 
 def _batch(array: np.ndarray) -> torch.Tensor:

@@ -14,11 +14,14 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole
+from lightdepth.frame import Frame
 from lightdepth.judge_colons import JudgeColon, judge_frames
 from lightdepth.judge_colons.endoscope import Exposure, LensKind
 from lightdepth.judge_colons.lamps import Lamp
@@ -33,32 +36,39 @@ LENSES = (
 )
 KINDS: tuple[LensKind, ...] = ("plain", "fisheye", "barrel", "narrow", "circle")
 EXPOSURES: tuple[Exposure, ...] = ("even", "even", "dark")
-FIRST, COUNT = int(os.environ.get("LIGHTDEPTH_FIRST_SEED", "7640")), 12
-OTHER_FIRST, OTHER_COUNT = int(os.environ.get("LIGHTDEPTH_FIRST_OTHER_SEED", "77100")), 8
+FIRST, COUNT = int(os.environ.get("LIGHTDEPTH_FIRST_SEED", "7640")), int(os.environ.get("LIGHTDEPTH_COUNT", "12"))
+OTHER_FIRST = int(os.environ.get("LIGHTDEPTH_FIRST_OTHER_SEED", "77100"))
+OTHER_COUNT = int(os.environ.get("LIGHTDEPTH_OTHER_COUNT", "8"))
 Colon = tuple[list[Look], PhotometricCalibration, float]
 
 
-def looks_at(
+def drawn(seed: int, much: bool) -> tuple[float, float]:
+    """The light's offset as a share of some 33 mm, and the wall's reflectance."""
+    rng = np.random.default_rng(seed)
+    return float(rng.uniform(0.08, 0.15)), float(rng.uniform(0.2, 0.6) if much else rng.uniform(0, 0.1))
+
+
+def frames_at(
     seed: int, lens: CameraModel, share: float, reflectance: float, frames: int = 12
-) -> tuple[list[Look], PhotometricCalibration]:
-    """Looks with true distances at a tube, with the light beside the lens by a share of some 33 mm."""
+) -> tuple[list[Frame], PhotometricCalibration]:
+    """Frames of a tube, with the light beside the lens by a share of some 33 mm."""
     turn = np.random.default_rng(seed).uniform(0, 2 * np.pi)
     place = (33 * share * float(np.cos(turn)), 33 * share * float(np.sin(turn)), 0.0)
     light = PhotometricCalibration(2.2, 1.5, place, reflectance=reflectance, source="given")
-    rendered = render_sequence(seed, frames, lens, 24.0, None, light)
-    looks = []
-    for f in rendered.frames:
-        assert f.true_distance is not None and f.true_world_from_cam is not None
-        looks.append(Look(f.camera, np.linalg.inv(f.true_world_from_cam), f.image, f.valid, f.true_distance))
-    return looks, light
+    return list(render_sequence(seed, frames, lens, 24.0, None, light).frames), light
 
 
 def tube(seed: int, much: bool) -> Colon:
-    rng = np.random.default_rng(seed)
-    share, reflectance = float(rng.uniform(0.08, 0.15)), float(rng.uniform(0.2, 0.6) if much else rng.uniform(0, 0.1))
-    return *looks_at(seed, LENSES[seed % 2], share, reflectance), reflectance
+    share, reflectance = drawn(seed, much)
+    frames, light = frames_at(seed, LENSES[seed % 2], share, reflectance)
+    looks = []
+    for f in frames:
+        assert f.true_distance is not None and f.true_world_from_cam is not None
+        looks.append(Look(f.camera, np.linalg.inv(f.true_world_from_cam), f.image, f.valid, f.true_distance))
+    return looks, light, reflectance
 
 
+@cache
 def other(seed: int, much: bool) -> Colon:
     """A colon of the judge's machinery, of another seed than the judge's twelve, with its light beside the lens by a
     share of some 26 mm."""
@@ -86,6 +96,19 @@ def other(seed: int, much: bool) -> Colon:
     return looks, frames[0].frame.light, rho
 
 
+def without_the_lens(seed: int, much: bool) -> Colon:
+    """As `other`, of a light file that does not say how much of mu is the lens's."""
+    looks, light, rho = other(seed, much)
+    return looks, replace(light, lamps=None), rho
+
+
+WORLDS = (
+    ("tube", tube, FIRST, COUNT),
+    ("other renderer, the lens's share of mu known", other, OTHER_FIRST, OTHER_COUNT),
+    ("other renderer, it is not known", without_the_lens, OTHER_FIRST, OTHER_COUNT),
+)
+
+
 def rows(
     make: Callable[[int, bool], Colon], seeds: range, much: bool
 ) -> Iterator[tuple[int, float, float, Millimetres, float]]:
@@ -99,7 +122,7 @@ def rows(
 
 def test_the_scale_of_colons() -> None:
     lines = []
-    for name, make, first, count in (("tube", tube, FIRST, COUNT), ("other renderer", other, OTHER_FIRST, OTHER_COUNT)):
+    for name, make, first, count in WORLDS:
         for much in (False, True):
             lines += [
                 f"\n{name}, rho {'.2 to .6' if much else 'up to .1'}\n",
