@@ -6,9 +6,13 @@ import ast
 from pathlib import Path
 
 import lightning.pytorch as pl
+import pytest
+import torch
 from raising import refused
 
-from train.fit import _refusals_named
+from lightdepth.errors import MachineFailure
+from train.fit import _apart_named, _refusals_named
+from train.folder import first_process
 from train.running import NO_ROOT, trainer_of_one
 from train.watching import with_callbacks
 
@@ -29,6 +33,20 @@ def test_no_checkpoint_that_lies_about_is_taken_on_a_cluster(tmp_path, monkeypat
 def test_a_job_that_lightning_cannot_run_in_is_told_as_a_mistake():
     with refused("--ntasks-per-node"), _refusals_named(RuntimeError):
         raise RuntimeError("You set `--ntasks=4`. HINT: Use `--ntasks-per-node=4` instead.")
+
+
+def test_processes_that_do_not_meet_are_a_failure_of_the_machine_s():
+    with pytest.raises(MachineFailure, match=r"do not meet \(port taken\): .*MASTER_PORT"), _apart_named():
+        raise torch.distributed.DistNetworkError("port taken\nand where")
+
+
+@pytest.mark.parametrize(("said", "first"), [({}, True), ({"NODE_RANK": "1"}, False), ({"NODE_RANK": "0"}, True)])
+def test_of_several_machines_the_first_one_s_process_writes(monkeypatch, said, first):
+    for name in ("RANK", "NODE_RANK", "GROUP_RANK"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in said.items():
+        monkeypatch.setenv(name, value)
+    assert first_process() == first
 
 
 def test_adapting_is_of_one_process_whatever_the_job_has(monkeypatch):

@@ -14,8 +14,9 @@ from lightdepth.datasets import open_sequence
 from lightdepth.frame import flipped, to_batch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.photometry import irradiance
+from train.augmentation import augmented
 from train.colons import TubeData
-from train.datamodule import FrameData, FrameDataModule, augmented
+from train.datamodule import FrameData, FrameDataModule
 from train.frame_lists import read_frame_list
 from train.loader import collate
 

@@ -151,7 +151,7 @@ class Diagnosis(pl.Callback):
         return self._row[what]
 
     def _where(self, trainer: pl.Trainer, batch_idx: int) -> str:
-        names = self.names(trainer.current_epoch, batch_idx) if trainer.world_size == 1 else []
+        names = self.names(trainer.current_epoch, batch_idx)
         shown = f" ({', '.join(names)})" if names else ""
         return f"step {trainer.global_step}, batch {batch_idx} of epoch {trainer.current_epoch}{shown}"
 

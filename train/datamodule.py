@@ -17,25 +17,23 @@ from typing import Annotated, NamedTuple, cast
 import lightning.pytorch as pl
 import numpy as np
 import torch
-from torch.utils.data import ConcatDataset, DataLoader, Dataset
+from torch.utils.data import ConcatDataset, DataLoader, Dataset, Sampler
 
 from lightdepth.colour import Colours
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.coloured import LOOKED_AT, colours_of
 from lightdepth.datasets.splits import check_apart, folders, read_split
 from lightdepth.errors import InputError
-from lightdepth.frame import FrameBatch, flipped, to_batch
-from lightdepth.losses import LossConfig
-from lightdepth.photometry import brightness, decode, encode
+from lightdepth.frame import FrameBatch, to_batch
 from lightdepth.ranges import BELOW_ONE, BETWEEN, SEED, Range, at_least, checked, ends_of
 from lightdepth.reporting.progress import Progress
+from train.augmentation import augmented, drawn_for
 from train.colons import SceneMaker, TubeData, colon_seeds, tube_scene, val_scene, with_reflectance
 from train.frame_lists import Listed, listed_rows, open_listed
 from train.loader import loader
-from train.order import Halves, Shuffled
+from train.order import ALONE, Halves, Parted, Place, Shuffled
 
 _NO_TUBE = TubeData()
-_WHITE = LossConfig().white
 _LOOKED_AT = 256  # frames whose colours are looked at, of all sequences together
 
 
@@ -137,6 +135,8 @@ class FrameDataModule(pl.LightningDataModule):
         self._unread: dict[str, dict[str, str]] = {"train": {}, "val": {}}  # what is said of frames, by file
         self.tell: Callable[[str], None] = warn
         """takes a sentence on a frame that could not be read, when it is met"""
+        self.parted = True
+        """whether each process of a distributed run has frames of its own, or all of them have all"""
         check_apart(self.sequences, self.val_sequences)
         self._train: ConcatDataset[FrameBatch] | None = None
         self._val: ConcatDataset[FrameBatch] | None = None
@@ -266,31 +266,34 @@ class FrameDataModule(pl.LightningDataModule):
         return {"train": len(self._train), "val": len(self._val)}
 
     def names(self, epoch: int, batch: int) -> list[str]:
-        """Names of the training frames of a batch of an epoch, in a run of one process."""
+        """Names of the training frames of a batch of an epoch, in this process."""
         assert self._train is not None, "setup() first"
         order = self._order()
         order.set_epoch(epoch)
         everyone = [name for part in self._train.datasets for name in part.names]  # type: ignore[attr-defined]  # ours have
-        first = batch * self.batch_size
-        return [everyone[i] for i in order.rows()[first : first + self.batch_size]]
+        return [everyone[i] for i in Parted(order, self.batch_size, self._place()).batch(batch)]
+
+    def _place(self) -> Place:
+        if self.trainer is None or not self.parted:
+            return ALONE
+        return Place(self.trainer.global_rank, self.trainer.world_size)
 
     def _order(self) -> Shuffled:
         assert self._train is not None
         colons = sum(len(part) for part in self._train.datasets if isinstance(part, _Cached))
         frames = len(self._train) - colons
         if self.config.halves and frames and colons:
-            return Halves(frames, colons, self.batch_size, self.config.seed)
+            return Halves(frames, colons, self.batch_size * self._place().world, self.config.seed)
         return Shuffled(len(self._train), self.config.seed)
 
     def train_dataloader(self) -> DataLoader[FrameBatch]:
         assert self._train is not None
-        sampler = self._order()
+        order, place = self._order(), self._place()
         if self._begun != (0, 0):
             epoch, batch = self._begun
-            # Of several processes each takes its share of all rows: there an epoch that was broken off begins anew.
-            alone = self.trainer is None or self.trainer.world_size == 1
-            sampler.go_on(epoch, batch * self.batch_size if alone else 0)
-        full = len(self._train) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
+            order.go_on(epoch, batch * self.batch_size * place.world)
+        sampler = order if place.world == 1 else Parted(order, self.batch_size, place)
+        full = len(sampler) >= self.batch_size  # one frame in a batch tells batch normalisation nothing
         return self._loader(self._train, "train", sampler, drop_last=full)
 
     def val_dataloader(self) -> DataLoader[FrameBatch]:
@@ -303,19 +306,18 @@ class FrameDataModule(pl.LightningDataModule):
         trainer = self.trainer
         if trainer is None or not trainer.training:
             return batch
-        # Every process of a distributed run augments in its own way.
-        seed = self.config.seed * 1_000_003 + trainer.global_step + trainer.global_rank * 1_000_000_007
-        generator = torch.Generator().manual_seed(seed)
+        place = Place(trainer.global_rank, trainer.world_size)
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + trainer.global_step)
         if self.config.augment:
-            batch = augmented(batch, generator)
+            batch = augmented(batch, generator, place)
         if self.config.random_reflectance is not None:
             low, high = self.config.random_reflectance
-            drawn = low + (high - low) * torch.rand(len(batch.image), 1, 1, 1, generator=generator)
-            batch = with_reflectance(batch, drawn.to(batch.image.device))
+            drawn = low + (high - low) * drawn_for(torch.rand, len(batch.image), generator, place)
+            batch = with_reflectance(batch, drawn.reshape(-1, 1, 1, 1).to(batch.image.device))
         return batch
 
     def _loader(
-        self, dataset: Dataset[FrameBatch], part: str, order: Shuffled | None = None, drop_last: bool = False
+        self, dataset: Dataset[FrameBatch], part: str, order: Sampler[int] | None = None, drop_last: bool = False
     ) -> DataLoader[FrameBatch]:
         left_out = partial(self._left_out, part)
         workers, replacing = self.config.num_workers, part == "train"  # an error counts once
@@ -336,20 +338,6 @@ def warn(sentence: str) -> None:
 def held_out_count(frames: int, share: float) -> int:
     """How many frames at the end of a sequence are held out."""
     return max(1, int(share * frames))
-
-
-def augmented(batch: FrameBatch, generator: torch.Generator) -> FrameBatch:
-    """Flips along both axes, each with probability 1/2, and linear exposure times exp(0.1 N), clipped at white.
-
-    What was saturated stays so: how bright it was, nobody knows, and darkened it would pass for a measurement.
-    """
-    count, device = len(batch.image), batch.image.device
-    for axis in (0, 1):
-        batch = flipped(batch, (torch.rand(count, generator=generator) < 0.5).to(device), axis)
-    exposure = torch.exp(0.1 * torch.randn(count, 1, 1, 1, generator=generator)).to(device)
-    gamma = batch.light.gamma
-    exposed = encode(exposure * decode(batch.image, gamma), gamma).clamp(max=1)
-    return batch._replace(image=torch.where(brightness(batch.image) >= _WHITE, batch.image, exposed))
 
 
 class _Frames(Dataset[FrameBatch]):

@@ -27,7 +27,7 @@ from lightdepth.checkpoint import load_model, save_model
 from lightdepth.command_line.dry import is_dry
 from lightdepth.counting import counted
 from lightdepth.datasets.no_camera import NoCamera
-from lightdepth.errors import InputError, Interrupted
+from lightdepth.errors import InputError, Interrupted, MachineFailure
 from lightdepth.files.named_inputs import write_inputs
 from lightdepth.files.replacing import output_of, read_record, unfinished_path
 from lightdepth.files.writing import sync_below, write_whole
@@ -152,6 +152,7 @@ def _fitted(
     start: Start | None,
 ) -> dict[str, float]:
     started = time.monotonic()
+    data.parted = bool(trainer_options.get("use_distributed_sampler", True))
     _opened(data.setup)
     asked = {"settings": yaml.safe_load(job.config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
     output = output_of(folder) or folder
@@ -187,7 +188,7 @@ def _fitted(
             data.go_on(start.epoch, start.batch)
             warn_of_length(echo, model, start, trainer.max_steps)
             warn_of_settings(echo, before, names.hidden(asked["settings"], exactly=True))
-        with _refusals_named(MisconfigurationException):
+        with _refusals_named(MisconfigurationException), _apart_named():
             path = None if start is None else start.path
             trainer.fit(model, datamodule=data, ckpt_path=path, weights_only=True)
         train_loss = trainer.callback_metrics.get("train/loss")
@@ -200,7 +201,8 @@ def _fitted(
     if trainer.is_global_zero:
         final = f"train loss {float(train_loss):.4g}  " if train_loss is not None else ""
         echo(f"final: {final}{validation_line(found)}")
-        record = _exported(model, data, folder, chosen, errors, job, echo)
+        shared = _shared(model, data, trainer.world_size, bool(options["sync_batchnorm"]))
+        record = _exported(model, data, folder, chosen, errors, job, echo, shared)
         if shows:
             echo(opening(trainer.logger, output))
         sync_below(folder)  # run.json says that the rest is whole
@@ -217,15 +219,17 @@ def _exported(
     errors: dict[str, float],
     job: _Job,
     echo: Echo,
+    shared: str,
 ) -> dict[str, object]:
-    """Writes the model of the chosen checkpoint with its card, and returns what run.json is to say."""
+    """Writes the model of the chosen checkpoint with its card, and returns what run.json is to say. `shared`: how
+    processes shared the work, where there were several."""
     exported = load_model(chosen)  # not `model`: where weights are averaged, the file has the average
     assert isinstance(exported, NetworkModel)
     doubt = _calibrate(exported.network, data, folder) if model.loss_config.uncertainty > 0 else None
     # Not the trainer's step: of processes started for the fit alone, it never hears.
     steps = int(torch.load(chosen.with_name(LAST), map_location="cpu", weights_only=True)["global_step"])
     card = TrainedCard(
-        trained_on=_trained_on(model, data),
+        trained_on=_trained_on(model, data) + shared,
         rows=model.rows,
         steps=steps,
         seed=job.seed,
@@ -280,6 +284,17 @@ def _refusals_named(*kinds: type[Exception]) -> Iterator[None]:
     except kinds as error:
         found = " ".join(str(error).split()).rstrip(".")
         raise InputError("--trainer", f"Lightning says: {found}", "see lightdepth train --help-all") from error
+
+
+@contextmanager
+def _apart_named() -> Iterator[None]:
+    """What is said where the processes of a run do not come together, or lose each other."""
+    try:
+        yield
+    except torch.distributed.DistError as error:
+        found = str(error).splitlines()[0]
+        cure = "does each machine reach MASTER_ADDR at a MASTER_PORT that nothing else takes, and do all still run?"
+        raise MachineFailure(f"the processes that train together do not meet ({found}): {cure}") from error
 
 
 @torch.no_grad()
@@ -355,6 +370,16 @@ def _trained_on(model: LightDepth, data: FrameDataModule) -> str:
     if model.loss_config.uncertainty > 0:
         truth += " of distance; the uncertainty head alone learned from true distance"
     return f"{' and '.join(parts)}, {data.size[0]}x{data.size[1]} pixels; {truth}."
+
+
+def _shared(model: LightDepth, data: FrameDataModule, processes: int, synchronised: bool) -> str:
+    """A sentence on how processes shared the work; none where there was one."""
+    if processes == 1:
+        return ""
+    own = ""
+    if any(isinstance(layer, torch.nn.BatchNorm2d) for layer in model.modules()):
+        own = ", batch statistics of " + ("all together" if synchronised else "each one's own frames")
+    return f" {processes} processes, batches of {data.batch_size} in each{own}."
 
 
 def _of_split(split: str | None) -> str:

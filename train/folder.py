@@ -8,6 +8,7 @@ one that ends before its first checkpoint leaves nothing; later, `--resume` goes
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -45,8 +46,10 @@ _OURS = (
 
 
 def first_process() -> bool:
-    """Known before there is a Trainer: the launcher's environment says it."""
-    return getattr(rank_zero_only, "rank", 0) == 0
+    """Known before there is a Trainer: the launcher's environment says it. Of several machines without a launcher that
+    counts processes over all of them (RANK), Lightning itself learns of NODE_RANK only then."""
+    other_machine = "RANK" not in os.environ and any(os.environ.get(n, "0") != "0" for n in ("NODE_RANK", "GROUP_RANK"))
+    return getattr(rank_zero_only, "rank", 0) == 0 and not other_machine
 
 
 def check_output(output: Path, resume: bool, overwrite: bool, inputs: Iterable[Path] = ()) -> None:

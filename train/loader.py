@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import NamedTuple, cast
 
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from lightdepth.errors import InputError, MachineFailure
 from lightdepth.frame import FrameBatch
 from lightdepth.photometry import LightTerms
-from train.order import Shuffled
 
 _GRACE_S = 120.0
 _KILLED = (
@@ -28,7 +27,7 @@ def loader(
     batch_size: int,
     workers: int,
     left_out: Callable[[InputError], None],
-    order: Shuffled | None = None,
+    order: Sampler[int] | None = None,
     drop_last: bool = False,
     replacing: bool = True,
 ) -> DataLoader[FrameBatch]:

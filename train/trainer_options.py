@@ -107,17 +107,18 @@ class TrainerSettings:
     """true: validation runs in PyTorch's inference mode, a little faster. false: it only leaves gradients out, for code
     that the mode does not suit. The results are the same."""
     use_distributed_sampler: bool = True
-    """Of several devices, true gives each its own part of the frames, and false gives all of them to each. With one
-    device it changes nothing."""
+    """Of several devices, true gives each its own part of the frames: together they see in a step what one would see
+    with a batch as large as all theirs. false gives all of them to each. With one device it changes nothing."""
     profiler: Literal["simple", "advanced", "pytorch"] | None = None
     """What measures where the time of a run goes: simple, advanced or pytorch, each in more detail and slower. Left
     out, nothing does."""
     detect_anomaly: bool = False
     """true: where a gradient is not a number, PyTorch names the operation that it came from; much slower. false: it
     does not look."""
-    sync_batchnorm: bool = False
+    sync_batchnorm: bool | None = None
     """Of several devices, true takes the mean and deviation of batch normalisation over the frames of all of them, and
-    false over those of each. With one device it changes nothing."""
+    false over those of each; left out, GPUs do the one and processors, which cannot do else, the other. With one device
+    it changes nothing."""
     reload_dataloaders_every_n_epochs: Annotated[int, at_least(0)] = 0
     """Number of epochs (passes over the training frames) after which what reads the frames is started anew; 0 for
     never. The frames stay the same. More do it less often."""

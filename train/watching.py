@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Annotated, Literal
 
 import lightning.pytorch as pl
+import torch
 from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging, LearningRateMonitor, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
@@ -92,6 +93,8 @@ def with_callbacks(
         extra.append(RichProgressBar())
     callbacks = options.get("callbacks") or []
     options["callbacks"] = [*(callbacks if isinstance(callbacks, list) else [callbacks]), *extra]
+    if options.get("sync_batchnorm") is None:
+        options["sync_batchnorm"] = options.get("accelerator") != "cpu" and torch.cuda.is_available()
     options["enable_checkpointing"] = False  # ours take the place of Lightning's
     options["plugins"] = [WholeCheckpoints()]
     options.setdefault("default_root_dir", NO_ROOT)
