@@ -198,7 +198,8 @@ def _none(n: int) -> ObservedDistances:
 
 _STEP, _STEPS_EACH_WAY, _APART, _FALL_AT = 0.025, 24, 5, 6
 _MARGIN, _FALL = 0.1, 0.1
-_HYPOTHESES = _STEP * np.arange(-_STEPS_EACH_WAY, _STEPS_EACH_WAY + 1)
+HYPOTHESES = _STEP * np.arange(-_STEPS_EACH_WAY, _STEPS_EACH_WAY + 1)
+"""Log distances from the guess at which a patch is compared."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +215,7 @@ class _Sweep:
 
     @property
     def shape(self) -> tuple[int, int]:
-        return len(self.guess), len(_HYPOTHESES)
+        return len(self.guess), len(HYPOTHESES)
 
     @property
     def corners(self) -> list[int]:
@@ -230,7 +231,7 @@ class _Sweep:
         rays, inside = camera.unproject(three)
         known = inside.reshape(-1, 3).all(1) & (distance > 0).all(1)
         distance = np.where(known[:, None], distance, 1.0)
-        places = rays.reshape(-1, 1, 3, 3) * (distance[:, None] * np.exp(_HYPOTHESES)[:, None])[..., None]
+        places = rays.reshape(-1, 1, 3, 3) * (distance[:, None] * np.exp(HYPOTHESES)[:, None])[..., None]
         half = patch // 2
         grid = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), -1).reshape(-1, 2)
         own = _sampled(look.brightness, pixels[:, None] + grid)
@@ -284,4 +285,4 @@ def _best(score: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
     left, right = beside(-1), beside(1)
     bend = np.minimum(left - 2 * top + right, -1e-9)
     part = np.clip(0.5 * (left - right) / bend, -0.5, 0.5)
-    return _HYPOTHESES[index] + _STEP * part, speaks
+    return HYPOTHESES[index] + _STEP * part, speaks
