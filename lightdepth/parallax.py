@@ -113,9 +113,10 @@ def textured(look: Look, config: ParallaxConfig) -> np.ndarray:
     for top, bottom in zip(rows[:-1], rows[1:], strict=True):
         for left, right in zip(columns[:-1], columns[1:], strict=True):
             cell = strength[top:bottom, left:right]
-            if cell.size and cell.max() > 0:
-                row, column = np.unravel_index(int(cell.argmax()), cell.shape)
-                found.append((left + column + 0.5, top + row + 0.5))
+            if cell.size:
+                row, column = divmod(int(cell.argmax()), cell.shape[1])
+                if cell[row, column] > 0:
+                    found.append((left + column + 0.5, top + row + 0.5))
     return np.array(found).reshape(-1, 2)
 
 
