@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, brightest
 from lightdepth.observations import ObservedDistances, sample_distance
 from lightdepth.prediction import DepthPrediction
 from lightdepth.ranges import Range, above, at_least, checked
@@ -87,7 +87,7 @@ class Look(Brief):
     def of(cls, keyframe: Keyframe, frame: Frame, width: int) -> Look:
         """Of a keyframe and its frame, whose camera is the keyframe's."""
         image, valid, camera = frame.image, frame.valid, keyframe.camera
-        clear = image.max(2) < _SATURATED * max(float(image.max()), 1e-6)
+        clear = brightest(image) < _SATURATED * max(float(image.max()), 1e-6)
         gray: np.ndarray = (0.3 * image[..., 0] + 0.7 * image[..., 1]).astype(np.float32)
         if camera.width > width:
             size = (width, max(1, round(camera.height * width / camera.width)))

@@ -10,9 +10,8 @@ from raising import refused
 
 from densify.bench.costs import bench_plan
 from densify.bench.work import BenchConfig
-from densify.costs import GIVEN, TABLE, Cost, SpeedFile, WholeRun, fitted, known_cost, read_speed
+from densify.costs import GIVEN, TABLE, Cost, WholeRun, fitted, known_cost, read_speed
 from densify.speed.tables import priced, workloads
-from lightdepth.reporting import plan
 
 
 def run(size: tuple[int, int], keyframes: int, cost: Cost, predict: float = 0.0) -> WholeRun:
@@ -111,8 +110,3 @@ def test_a_procedure_costs_what_its_keyframes_and_maps_do():
     price = priced(one, RUNS)
     assert price.processor_hours == pytest.approx(2 * TRUE.of(475, 1440 * 1080 / 1e6, 19) / 3600)
     assert priced(year, RUNS).processor_hours == pytest.approx(1e4 * price.processor_hours)
-
-
-def test_what_bench_speed_writes_is_what_costs_read():
-    assert SpeedFile(kind="bench speed", slowness=1.0, runs=RUNS).runs == RUNS
-    assert plan.slowness() > 0

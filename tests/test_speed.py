@@ -20,6 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from densify import agreement
 from densify.commands import bench_speed
 from densify.commands.bench import measure_speed
+from densify.costs import fitted, read_speed
 from densify.fusion import rectify, volume
 from densify.speed import loads
 from densify.speed.given import Given, write_colon
@@ -196,13 +197,15 @@ def test_a_run_says_every_stage_whole_runs_and_costs(run):
     (at,) = found["sizes"]
     assert at["size"] == list(SIZE)
     assert [stage["name"] for stage in at["stages"]] == [s.name for s in STAGES if not s.network]
-    assert [each["keyframes"] for each in found["runs"]] == [4, 8]
+    assert [each["keyframes"] for each in found["runs"]] == [4, 8, 4]
+    assert found["runs"][2]["size"] == [2 * side for side in SIZE]
     for each in found["runs"]:
         assert {"read", "predict", "align", "judge", "agree", "integrate", "extract"} <= set(each["steps"])
         assert sum(each["steps"].values()) < each["seconds"] and each["bytes"] > 1e5
     assert found["cost"]["a hospital's year"]["processor_hours"] == pytest.approx(
         1e4 * found["cost"]["a screening procedure"]["processor_hours"]
     )
+    assert fitted(read_speed(run / "speed.json").runs, lambda each: each.besides).of(4, 0.01) > 0
     text = (run / "speed.md").read_text(encoding="utf-8")
     assert "over the floor" in text and "a hospital's year" in text and "VoxelBlockGrid" in text
     assert check_self_contained(run / "report.html").tags.count("table") == 3

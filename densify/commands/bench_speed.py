@@ -10,7 +10,7 @@ import torch
 
 from densify.bench.files import write_json, write_tables
 from densify.speed.machine import measured_machine, threads
-from densify.speed.runs import Size
+from densify.speed.runs import Size, colons_of
 from densify.speed.tables import notes, record, tables
 from densify.speed.work import measured, parts
 from lightdepth.checkpoint import ModelSource
@@ -44,8 +44,8 @@ def measure_speed(
     Args:
         output: Folder to make, with speed.json, .md and report.html. Where it is runs/speed, dry runs in the same
             folder take their times from it; LIGHTDEPTH_SPEED names another speed.json.
-        image_sizes: Widths and heights of the frames, pixels, each measured on its own. Larger ones and more take
-            longer; costs of other sizes are reckoned from these.
+        image_sizes: Widths and heights of the frames, pixels, each measured on its own; a whole run is made at twice
+            the last one's, too. Larger ones and more take longer; costs of other sizes are reckoned from these.
         keyframes: Number of keyframes of the map that is made for each size; the first has another one, with twice as
             many. More tell better what a keyframe costs and take longer.
         seconds: Time for which a stage and its reference are timed in turns, seconds, for each size; slow ones are
@@ -60,7 +60,8 @@ def measure_speed(
     with run_folder(output, "bench speed", arguments, overwrite) as run:
         run.hash_inputs(checkpoint=Path(predicting.checkpoint))
         shown = ", ".join(f"{width}x{height}" for width, height in image_sizes)
-        what = f"stages of densify at {shown}, and {counted(len(image_sizes) + 1, 'whole run')}, would be timed"
+        whole = counted(len(colons_of(image_sizes, keyframes)), "whole run")
+        what = f"stages of densify at {shown}, and {whole}, would be timed"
         taken = count * (seconds + _PART * slowness())
         run.begins(what, lambda: [Step(f"timing {counted(count, 'part')}", taken)])
         slow = slowness()

@@ -21,6 +21,7 @@ from densify.fusion.compiled import compiled
 from densify.fusion.second_core import halves
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.errors import InputError
+from lightdepth.frame import brightest
 from lightdepth.prediction import DepthPrediction
 from lightdepth.ranges import SHARE, above, checked
 
@@ -126,7 +127,7 @@ def surface_view(
     if config.field == "pinhole":
         valid &= lens.in_pinhole
     distance = np.where(valid, prediction.distance, 1).astype(np.float32, copy=False)
-    light = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2]).astype(np.float32)
+    light = brightest(image).astype(np.float32)
     color, sigma = image, prediction.uncertainty
     kept = feathered(valid, config.feather)
     if share is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from densify.config import DensifyConfig
@@ -20,10 +21,21 @@ from lightdepth.sfm.config import SfmConfig
 Size = tuple[int, int]
 
 
-def colons_of(sizes: Sequence[Size], keyframes: int) -> list[tuple[Size, int]]:
-    """Sizes and numbers of keyframes of the colons that are run: each size, and the first with twice as many keyframes,
-    so that what a run and what a keyframe takes can be told apart."""
-    return [*((size, keyframes) for size in sizes), (sizes[0], 2 * keyframes)]
+@dataclass(frozen=True)
+class Colon:
+    """A colon that a whole run is made of."""
+
+    size: Size
+    keyframes: int
+    staged: bool
+    """whether its stages are timed too"""
+
+
+def colons_of(sizes: Sequence[Size], keyframes: int) -> list[Colon]:
+    """Each size; the first with twice as many keyframes, so that what a run and what a keyframe takes can be told
+    apart; and the last at twice its width and height, as frames of endoscopes are large."""
+    (width, height), more = sizes[-1], Colon(sizes[0], 2 * keyframes, False)
+    return [*(Colon(size, keyframes, True) for size in sizes), more, Colon((2 * width, 2 * height), keyframes, False)]
 
 
 def whole_run(colon: Path, output: Path, model: DepthModel, predicting: ModelSource) -> WholeRun:

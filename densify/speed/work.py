@@ -99,16 +99,18 @@ def measured(
     is told `parts` times that a part is done."""
     stages: dict[Size, list[StageTime]] = {}
     runs = []
-    for number, (size, count) in enumerate(colons_of(sizes, keyframes)):
+    for number, made in enumerate(colons_of(sizes, keyframes)):
         colon = folder / f"colon{number}"
-        write_colon(colon, size, count)
+        write_colon(colon, made.size, made.keyframes)
+        if not number:  # what a process does once is no run's
+            whole_run(colon, folder / "first", model, predicting)
         runs.append(whole_run(colon, folder / f"run{number}", model, predicting))
         on_part()
-        if count == keyframes:
-            stages[size] = timed_stages(colon, model, machine, seconds, on_part)
+        if made.staged:
+            stages[made.size] = timed_stages(colon, model, machine, seconds, on_part)
     return stages, runs
 
 
 def parts(sizes: Sequence[Size], model: DepthModel) -> int:
     """How many parts `measured` has."""
-    return len(sizes) * (1 + len(stages_of(model))) + 1
+    return len(colons_of(sizes, 1)) + len(sizes) * len(stages_of(model))
