@@ -18,15 +18,15 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from densify import agreement
-from densify.commands import bench_speed
 from densify.commands.bench import measure_speed
 from densify.costs import fitted, read_speed
 from densify.fusion import rectify, volume
 from densify.speed import loads
+from densify.speed import machine as machine_room
 from densify.speed.given import Given, write_colon
-from densify.speed.machine import Load, Machine, measured_machine, side_by_side
+from densify.speed.machine import Load, Machine, Rates, measured_machine, side_by_side
 from densify.speed.references import lmeds_by_partition
-from densify.speed.stages import STAGES
+from densify.speed.stages import STAGES, Stage
 from densify.speed.work import stages_of, timed_stage
 from lightdepth.checkpoint import ModelSource, load_model
 from lightdepth.decline import masked_blur
@@ -49,23 +49,38 @@ def machine() -> Machine:
     return measured_machine(CPU, copied=2**22, side=512)
 
 
+def one(name: str) -> Stage:
+    """The stage of that name."""
+    (found,) = (stage for stage in STAGES if stage.name == name)
+    return found
+
+
 def load_of(name: str, given: Given) -> Load:
-    (stage,) = (stage for stage in STAGES if stage.name == name)
-    return stage.load(given)
+    return one(name).load(given)
 
 
 def test_a_floor_is_the_longer_of_what_is_moved_and_what_is_done():
-    machine = Machine("cpu", 1, 10.0, {"float32": 100.0, "comparison": 50.0})
-    assert machine.floor(Load({"float32": 200.0, "comparison": 100.0}, 10.0)) == pytest.approx(4.0)
-    assert machine.floor(Load({"float32": 200.0}, 100.0)) == pytest.approx(10.0)
+    rates = Rates(10.0, {"float32": 100.0, "comparison": 50.0})
+    assert rates.floor(Load({"float32": 200.0, "comparison": 100.0}, 10.0)) == pytest.approx(4.0)
+    assert rates.floor(Load({"float32": 200.0}, 100.0)) == pytest.approx(10.0)
 
 
 def test_every_stage_takes_longer_than_its_floor_and_is_measured_beside_a_reference(given, machine):
     for stage in stages_of(given.model):
-        found = timed_stage(stage, given, machine, 0.0)
-        assert 0 < found.floor <= found.least <= found.seconds, stage.name
-        assert found.reference_seconds > 0 and found.rounds >= 3
+        found = timed_stage(stage, given, [machine], 0.0)
+        assert 0 < found.floor.clock <= found.least.clock <= found.median.clock, stage.name
+        assert 0 < found.floor.core <= found.median.core, stage.name
+        assert found.reference_median.clock > 0 and found.rounds >= 3
         assert found.bytes > 0
+
+
+def test_a_stage_that_runs_where_the_model_does_has_the_floor_of_that_machine(given):
+    rates = dict.fromkeys(("float32", "bfloat16", "float64", "comparison"), 1e12)
+    quick, slow = Rates(1e12, rates), Rates(1.0, rates)
+    machines = [Machine("cpu", 1, quick, quick), Machine("another", 1, slow, slow)]
+    found = {name: timed_stage(one(name), given, machines, 0.0) for name in ("closed form", "sampling")}
+    assert found["closed form"].device == "another" and found["closed form"].floor.clock == found["closed form"].bytes
+    assert found["sampling"].device == "cpu" and found["sampling"].floor.clock < 1e-3
 
 
 def test_the_network_s_operations_are_those_of_its_layers(given):
@@ -136,8 +151,7 @@ def test_a_round_of_agreement_is_counted_by_the_rows_that_it_solves(given, monke
         return kept(rows, *others, **named)
 
     monkeypatch.setattr(agreement, "_step", step)
-    (stage,) = (stage for stage in STAGES if stage.name.startswith("agreement"))
-    stage.run(given)
+    one("agreement, a round").run(given)
     counted = 0.0
     for row in seen:
         columns = sum(block.shape[1] for block in row.blocks.values())
@@ -187,7 +201,7 @@ def run(tmp_path_factory) -> Path:
     """A whole run, as small as it gets."""
     folder = tmp_path_factory.mktemp("run") / "speed"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench_speed, "measured_machine", partial(measured_machine, copied=2**22, side=512))
+        patch.setattr(machine_room, "measured_machine", partial(measured_machine, copied=2**22, side=512))
         measure_speed(folder, ModelSource("decline"), (SIZE,), keyframes=4, seconds=0.01)
     return folder
 

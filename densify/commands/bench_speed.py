@@ -9,7 +9,7 @@ from typing import Annotated
 import torch
 
 from densify.bench.files import write_json, write_tables
-from densify.speed.machine import measured_machine, threads
+from densify.speed.machine import machines_of, threads
 from densify.speed.runs import Size, colons_of
 from densify.speed.tables import notes, record, tables
 from densify.speed.work import measured, parts
@@ -35,7 +35,7 @@ def measure_speed(
     output: Path = Path("runs/speed"),
     predicting: Group[ModelSource] = ModelSource(),
     image_sizes: Annotated[tuple[tuple[int, int], ...], at_least(64, up_to=4096)] = _SIZES,
-    keyframes: Annotated[int, at_least(4, up_to=1000)] = 6,
+    keyframes: Annotated[int, at_least(4, up_to=1000)] = 10,
     seconds: Annotated[float, above(0, up_to=3600)] = 0.7,
     overwrite: bool = False,
 ) -> None:
@@ -65,11 +65,11 @@ def measure_speed(
         taken = count * (seconds + _PART * slowness())
         run.begins(what, lambda: [Step(f"timing {counted(count, 'part')}", taken)])
         slow = slowness()
-        machine = measured_machine(model.device if isinstance(model, NetworkModel) else torch.device("cpu"))
+        machines = machines_of(model.device if isinstance(model, NetworkModel) else torch.device("cpu"))
         with TemporaryDirectory() as made, Progress("Speed", count) as bar:
-            found = measured(image_sizes, keyframes, model, predicting, machine, seconds, Path(made), bar.advance)
-        said = notes(machine, threads(), model.name, found[1])
+            found = measured(image_sizes, keyframes, model, predicting, machines, seconds, Path(made), bar.advance)
+        said = notes(machines, threads(), model.name, found[1])
         made_by = {"versions": versions(), "revision": git_revision(), "notes": said}
-        write_json(run, "speed.json", record(machine, threads(), slow, *found) | made_by)
+        write_json(run, "speed.json", record(machines, threads(), slow, *found) | made_by)
         write_tables(run, "speed", "Speed beside what the machine allows", tables(*found), said, [])
     end(output, then="lightdepth densify DATA -o OUT --dry-run", page=output / "report.html")

@@ -46,6 +46,21 @@ class Load:
 
 
 @dataclass(frozen=True)
+class Rates:
+    """What is done in a second."""
+
+    bandwidth: float
+    """bytes read and written, by a copy"""
+    operations: Mapping[Kind, float]
+    """by products of matrices (2 n^3 each), and comparisons by a sort"""
+
+    def floor(self, load: Load) -> float:
+        """Seconds that a load takes at the least."""
+        done = sum(count / self.operations[kind] for kind, count in load.operations.items())
+        return max(load.bytes / self.bandwidth, done)
+
+
+@dataclass(frozen=True)
 class Machine:
     """What a machine does at best."""
 
@@ -53,19 +68,29 @@ class Machine:
     """what PyTorch calls it"""
     threads: int
     """with which copy and products were taken; a sort has one"""
-    bandwidth: float
-    """bytes read and written a second, by a copy"""
-    rates: Mapping[Kind, float]
-    """operations a second: by products of matrices (2 n^3 each), and comparisons by a sort"""
+    clock: Rates
+    """in a second of the clock"""
+    core: Rates
+    """in a second of a processor's core: what other work on the machine hardly changes"""
 
-    def floor(self, load: Load) -> float:
-        """Seconds that a load takes at the least."""
-        return max(load.bytes / self.bandwidth, sum(n / self.rates[kind] for kind, n in load.operations.items()))
+
+@dataclass(frozen=True)
+class Taken:
+    """Seconds that a piece of work took."""
+
+    clock: float
+    core: float
+    """of all cores together"""
 
 
 def comparisons(count: int) -> float:
     """Comparisons that no sort of so many can do without: the logarithm of the number of their orders, to base 2."""
     return math.lgamma(count + 1) / math.log(2)
+
+
+def machines_of(device: torch.device) -> list[Machine]:
+    """The processor, and the device of the model where that is another."""
+    return [measured_machine(each) for each in dict.fromkeys((torch.device("cpu"), device))]
 
 
 def threads() -> Mapping[str, int]:
@@ -84,32 +109,36 @@ def measured_machine(device: torch.device, copied: int = _COPIED, side: int = _S
     torch.set_num_threads(most)
     try:
         source = torch.ones(copied, device=device)
-        target = torch.empty_like(source)
-        copy = least(lambda: target.copy_(source), device)
-        rates: dict[Kind, float] = {}
+        copy = least(partial(torch.empty_like(source).copy_, source), device)
+        products: dict[Kind, Taken] = {}
         for kind, number in _MULTIPLIED.items():
             square = torch.rand(side, side, device=device).to(number)
-            rates[kind] = 2 * side**3 / least(partial(torch.matmul, square, square), device)
+            products[kind] = least(partial(torch.matmul, square, square), device)
     finally:
         torch.set_num_threads(before)
-    values = np.random.default_rng(0).random(_SORTED)
-    rates["comparison"] = comparisons(_SORTED) / least(partial(np.sort, values), device)
-    return Machine(str(device), most, 2 * source.nbytes / copy, rates)
+    sort = least(partial(np.sort, np.random.default_rng(0).random(_SORTED)), device)
+
+    def rates(of: Callable[[Taken], float]) -> Rates:
+        operations = {kind: 2 * side**3 / of(taken) for kind, taken in products.items()}
+        return Rates(2 * source.nbytes / of(copy), {**operations, "comparison": comparisons(_SORTED) / of(sort)})
+
+    return Machine(str(device), most, rates(lambda taken: taken.clock), rates(lambda taken: taken.core))
 
 
-def least(work: Callable[[], object], device: torch.device) -> float:
-    """Seconds that work takes, the least of some times after a first one."""
-    return min(side_by_side([work], 0.0, device, _ROUNDS)[0])
+def least(work: Callable[[], object], device: torch.device) -> Taken:
+    """What work takes, each the least of some times after a first one."""
+    (taken,) = side_by_side([work], 0.0, device, _ROUNDS)
+    return Taken(min(each.clock for each in taken), min(each.core for each in taken))
 
 
 def side_by_side(
     works: Sequence[Callable[[], object]], seconds: float, device: torch.device, rounds: int = _LEAST
-) -> list[list[float]]:
-    """Seconds that each work took, each time: after a first time, which is not counted, as often as `seconds` have room
-    for all, and at least `rounds` times. They take turns, so that a busy machine slows them alike."""
+) -> list[list[Taken]]:
+    """What each work took, each time: after a first time, which is not counted, as often as `seconds` have room for
+    all, and at least `rounds` times. They take turns, so that a busy machine slows them alike."""
     for work in works:
         _timed(work, device)
-    taken: list[list[float]] = [[] for _ in works]
+    taken: list[list[Taken]] = [[] for _ in works]
     end = time.perf_counter() + seconds
     while len(taken[0]) < rounds or (time.perf_counter() < end and len(taken[0]) < _MOST):
         for work, times in zip(works, taken, strict=True):
@@ -117,12 +146,12 @@ def side_by_side(
     return taken
 
 
-def _timed(work: Callable[[], object], device: torch.device) -> float:
+def _timed(work: Callable[[], object], device: torch.device) -> Taken:
     _settle(device)
-    start = time.perf_counter()
+    clock, core = time.perf_counter(), time.process_time()
     work()
     _settle(device)
-    return time.perf_counter() - start
+    return Taken(time.perf_counter() - clock, max(time.process_time() - core, 1e-9))
 
 
 def _settle(device: torch.device) -> None:

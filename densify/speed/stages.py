@@ -50,6 +50,8 @@ class Stage:
     """of densify, by its clock (densify.pipeline); empty where densify does no such thing"""
     network: bool = False
     """whether there is such a stage for networks alone"""
+    with_model: bool = False
+    """whether it runs where the model does; the others stay on the processor"""
 
 
 def _in_bfloat16(work: Work) -> Work:
@@ -228,6 +230,7 @@ STAGES = (
         _plain_forward,
         "predict",
         network=True,
+        with_model=True,
     ),
     Stage(
         "network, bfloat16",
@@ -237,6 +240,7 @@ STAGES = (
         "the network's forward alone",
         _in_bfloat16(_plain_forward),
         network=True,
+        with_model=True,
     ),
     Stage(
         "closed form",
@@ -245,6 +249,7 @@ STAGES = (
         lambda given: loads.closed_form(_closed_pixels(given), _kernel(given)),
         "two cv2.GaussianBlur",
         _two_blurs,
+        with_model=True,
     ),
     Stage(
         "sampling",

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from densify.bench.scenes import scenes
 from densify.costs import Cost, WholeRun, fitted
 from densify.evaluation.tables import Table
-from densify.speed.machine import Machine
+from densify.speed.machine import Machine, Rates
 from densify.speed.runs import Size
 from densify.speed.work import StageTime
 from lightdepth.reporting.report import number
@@ -64,7 +64,7 @@ def priced(load: Workload, runs: Sequence[WholeRun]) -> Price:
 
 
 def record(
-    machine: Machine,
+    machines: Sequence[Machine],
     threads: Mapping[str, int],
     slowness: float,
     stages: Mapping[Size, Sequence[StageTime]],
@@ -75,11 +75,14 @@ def record(
         "kind": "bench speed",
         "version": VERSION,
         "unit": "seconds, bytes, operations; rates a second",
-        "machine": machine,
+        "machines": machines,
         "threads": threads,
         "slowness": slowness,
         "sizes": [
-            {"size": size, "stages": [asdict(s) | {"ratio": s.ratio, "faster": s.faster} for s in found]}
+            {
+                "size": size,
+                "stages": [asdict(s) | _ratios(s) for s in found],
+            }
             for size, found in stages.items()
         ],
         "runs": [run.model_dump() for run in runs],
@@ -90,6 +93,10 @@ def record(
 def tables(stages: Mapping[Size, Sequence[StageTime]], runs: Sequence[WholeRun]) -> list[Table]:
     """Stages by size, whole runs, costs."""
     return [*(_stages(size, found) for size, found in stages.items()), _runs(runs), _costs(runs)]
+
+
+def _ratios(stage: StageTime) -> dict[str, float]:
+    return {"ratio": stage.ratio, "core_ratio": stage.core_ratio, "faster": stage.faster}
 
 
 def _ms(seconds: float) -> str:
@@ -103,16 +110,19 @@ def _stages(size: Size, found: Sequence[StageTime]) -> Table:
             stage.step or "–",
             number(sum(stage.operations.values()) / 1e6),
             number(stage.bytes / 1e6),
-            _ms(stage.floor),
-            _ms(stage.seconds),
+            _ms(stage.floor.clock),
+            _ms(stage.median.clock),
             number(stage.ratio),
+            _ms(stage.median.core),
+            number(stage.core_ratio),
             stage.reference,
-            _ms(stage.reference_seconds),
+            _ms(stage.reference_median.clock),
             number(stage.faster),
         ]
         for stage in found
     ]
     headers = ["stage", "step of densify", "million operations", "MB", "floor ms", "ms", "over the floor"]
+    headers += ["core ms", "over a core's floor"]
     headers += ["reference", "its ms", "reference over ours"]
     return Table(f"{size[0]}x{size[1]}: stages, median times", headers, rows)
 
@@ -140,18 +150,27 @@ def _costs(runs: Sequence[WholeRun]) -> Table:
     return Table(title, ["what", "procedures", "keyframes", "core hours", "days", "GB"], rows)
 
 
-def notes(machine: Machine, threads: Mapping[str, int], model: str, runs: Sequence[WholeRun]) -> list[str]:
+def notes(machines: Sequence[Machine], threads: Mapping[str, int], model: str, runs: Sequence[WholeRun]) -> list[str]:
     """What the figures were taken on, and how they are read."""
-    rates = ", ".join(f"{number(rate / 1e9)} ({kind})" for kind, rate in machine.rates.items())
     used = ", ".join(f"{count} of {library}" for library, count in threads.items())
     return [
-        f"Machine: {machine.device}, {machine.threads} threads: a copy moves {number(machine.bandwidth / 1e9)} GB/s; "
-        f"thousand million operations a second: {rates}. Threads of stages: {used}. Model: {model}.",
+        *map(_of_machine, machines),
+        f"Threads of stages: {used}. Model: {model}.",
         "A floor is the time of the bytes at the copy's rate or of the operations at the product's (comparisons: at a "
-        "sort's), whichever is longer. Stage and reference were timed in turns.",
+        "sort's), whichever is longer. Stage and reference were timed in turns. Milliseconds of a core, of all threads "
+        "together, are hardly changed by other work on the machine; those of the clock are.",
         f"Model of cost: seconds besides prediction {_said(fitted(runs, lambda run: run.besides))}; seconds of "
         f"processors {_said(fitted(runs, lambda run: run.processor))}.",
     ]
+
+
+def _of_machine(machine: Machine) -> str:
+    return f"{machine.device}, {machine.threads} threads: {_rates(machine.clock)}; a core: {_rates(machine.core)}."
+
+
+def _rates(rates: Rates) -> str:
+    done = ", ".join(f"{number(rate / 1e9)} ({kind})" for kind, rate in rates.operations.items())
+    return f"a copy moves {number(rates.bandwidth / 1e9)} GB/s, thousand million operations a second: {done}"
 
 
 def _said(cost: Cost) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from densify.costs import WholeRun
 from densify.speed.given import Given, write_colon
-from densify.speed.machine import Kind, Machine, side_by_side
+from densify.speed.machine import Kind, Machine, Taken, side_by_side
 from densify.speed.runs import Size, colons_of, whole_run
 from densify.speed.stages import STAGES, Stage
 from lightdepth.checkpoint import ModelSource
@@ -20,33 +20,38 @@ from lightdepth.models import DepthModel, NetworkModel
 
 @dataclass(frozen=True)
 class StageTime:
-    """One stage at one size. Times in seconds."""
+    """One stage at one size."""
 
     name: str
     what: str
     step: str
     """of densify, by its clock; empty where densify does no such thing"""
+    device: str
     operations: Mapping[Kind, float]
     bytes: float
-    floor: float
+    floor: Taken
     """the least that this machine can take for it"""
-    seconds: float
-    """the median of some times"""
-    least: float
+    median: Taken
+    least: Taken
     rounds: int
     reference: str
-    reference_seconds: float
-    """the median of as many times"""
+    reference_median: Taken
+    """of as many times"""
 
     @property
     def ratio(self) -> float:
-        """Of the time to the floor."""
-        return self.seconds / self.floor
+        """Of the time by the clock to the floor."""
+        return self.median.clock / self.floor.clock
+
+    @property
+    def core_ratio(self) -> float:
+        """The same by seconds of a core."""
+        return self.median.core / self.floor.core
 
     @property
     def faster(self) -> float:
-        """How many times as long the reference takes."""
-        return self.reference_seconds / self.seconds
+        """How many times as long the reference takes, by the clock."""
+        return self.reference_median.clock / self.median.clock
 
 
 def stages_of(model: DepthModel) -> list[Stage]:
@@ -54,33 +59,39 @@ def stages_of(model: DepthModel) -> list[Stage]:
     return [stage for stage in STAGES if isinstance(model, NetworkModel) or not stage.network]
 
 
-def timed_stage(stage: Stage, given: Given, machine: Machine, seconds: float) -> StageTime:
-    """A stage and its reference, in turns, for about so many seconds together."""
-    load = stage.load(given)
+def timed_stage(stage: Stage, given: Given, machines: Sequence[Machine], seconds: float) -> StageTime:
+    """A stage and its reference, in turns, for about so many seconds together. Of the machines the first is the
+    processor, and the last what the model runs on."""
+    load, machine = stage.load(given), machines[-1 if stage.with_model else 0]
     works = [partial(stage.run, given), partial(stage.plain, given)]
     own, plain = side_by_side(works, seconds, given.device)
     return StageTime(
         name=stage.name,
         what=stage.what,
         step=stage.step,
+        device=machine.device,
         operations=load.operations,
         bytes=load.bytes,
-        floor=machine.floor(load),
-        seconds=float(np.median(own)),
-        least=min(own),
+        floor=Taken(machine.clock.floor(load), machine.core.floor(load)),
+        median=_of_each(np.median, own),
+        least=_of_each(np.min, own),
         rounds=len(own),
         reference=stage.reference,
-        reference_seconds=float(np.median(plain)),
+        reference_median=_of_each(np.median, plain),
     )
 
 
+def _of_each(choose: Callable[[Sequence[float]], float], taken: Sequence[Taken]) -> Taken:
+    return Taken(float(choose([each.clock for each in taken])), float(choose([each.core for each in taken])))
+
+
 def timed_stages(
-    colon: Path, model: DepthModel, machine: Machine, seconds: float, on_stage: Callable[[], None]
+    colon: Path, model: DepthModel, machines: Sequence[Machine], seconds: float, on_stage: Callable[[], None]
 ) -> list[StageTime]:
     """Every stage on a colon."""
     given, found = Given(colon, model), []
     for stage in stages_of(model):
-        found.append(timed_stage(stage, given, machine, seconds))
+        found.append(timed_stage(stage, given, machines, seconds))
         on_stage()
     return found
 
@@ -90,7 +101,7 @@ def measured(
     keyframes: int,
     model: DepthModel,
     predicting: ModelSource,
-    machine: Machine,
+    machines: Sequence[Machine],
     seconds: float,
     folder: Path,
     on_part: Callable[[], None],
@@ -107,7 +118,7 @@ def measured(
         runs.append(whole_run(colon, folder / f"run{number}", model, predicting))
         on_part()
         if made.staged:
-            stages[made.size] = timed_stages(colon, model, machine, seconds, on_part)
+            stages[made.size] = timed_stages(colon, model, machines, seconds, on_part)
     return stages, runs
 
 
