@@ -133,7 +133,7 @@ def agree(
         return bends
     unknowns = len(bending.precision)
     prior = np.tile(bending.precision, len(views))
-    pairs = _pairs(shared, config.neighbours) if config.overlap else []
+    pairs = compared_pairs(shared, config.neighbours) if config.overlap else []
     places = [_Places(view, bend, config.samples) for view, bend in zip(views, bends, strict=True)]
     most = [inlier_deviation(_residual(*each)) for each in zip(views, bends, places, strict=True)]
     bends = bends if start is None else list(start)
@@ -305,7 +305,7 @@ def _weight(x: np.ndarray) -> np.ndarray:
     return robust_weights(x / _WIDTH)
 
 
-def _pairs(shared: np.ndarray, neighbours: int) -> list[tuple[int, int]]:
+def compared_pairs(shared: np.ndarray, neighbours: int) -> list[tuple[int, int]]:
     """Each view with those that share most points with it, in both directions."""
     pairs = set()
     for i, row in enumerate(shared):

@@ -202,7 +202,16 @@ def _on_grid(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 def _bumps(x: np.ndarray, n: int) -> np.ndarray:
     """Gaussians (len(x), n) centred at n places from 0 to 1, as wide as their step."""
-    return np.exp(-0.5 * ((x[:, None] - np.linspace(0, 1, n)) * (n - 1)) ** 2)
+    result: np.ndarray = np.exp(-0.5 * ((x[:, None] - _places(n)) * (n - 1)) ** 2)
+    return result
+
+
+@lru_cache(maxsize=64)
+def _places(n: int) -> np.ndarray:
+    """n places from 0 to 1 (n,), not to be written to: thousands of short calls ask for the same."""
+    places = np.linspace(0, 1, n)
+    places.flags.writeable = False
+    return places
 
 
 @lru_cache(maxsize=8)

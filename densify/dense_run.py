@@ -1,7 +1,12 @@
-"""A sequence becomes a run folder of dense surfaces: what the verb densify does, and batch for each of many."""
+"""A sequence becomes a run folder of dense surfaces: what the verb densify does, batch for each of many, and `bench
+speed` against the clock."""
 
 from __future__ import annotations
 
+import io
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,8 +20,10 @@ from densify.page import FILES, densify_page, joined_section
 from densify.scale_file import MmPerUnit
 from lightdepth.calibration import read_light
 from lightdepth.checkpoint import ModelSource
+from lightdepth.command_line.outcome import OUTCOME, Outcome
 from lightdepth.datasets import SequenceSource
 from lightdepth.models import DepthModel
+from lightdepth.reporting.names import KEPT
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
 
@@ -81,3 +88,17 @@ def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = F
             joined_section(page, work.merged)
         page.files(run.folder, FILES)
         page.write(run.folder / "report.html")
+
+
+@contextmanager
+def unheard(words: Sequence[str], keep_names: bool = False) -> Iterator[None]:
+    """Runs made within it say nothing to the terminal (their logs have it), and note `words` as the command line: the
+    real one may name patients."""
+    with ExitStack() as ending:
+        ending.callback(setattr, sys, "argv", sys.argv)
+        sys.argv = list(words)
+        for variable, value in ((KEPT, keep_names), (OUTCOME, Outcome(quiet=True))):
+            ending.callback(variable.reset, variable.set(value))  # type: ignore[arg-type]  # each has its own type
+        for redirected in (redirect_stdout, redirect_stderr):
+            ending.enter_context(redirected(io.StringIO()))
+        yield

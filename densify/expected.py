@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lightdepth.frame import brightest
 from lightdepth.prediction import DepthPrediction
 
 _DARK, _BRIGHT = 0.3, 0.98  # of the brightest channel
@@ -29,6 +30,6 @@ def expected_share(prediction: DepthPrediction, reach: float, image: np.ndarray)
     error *= np.exp(np.float32(0.22) * (distance / np.float32(max(reach, 1e-12)) - 1).clip(0, 9))
     if prediction.uncertainty is not None:
         error *= (prediction.uncertainty / np.float32(0.09)).clip(0.6, 2).astype(np.float32) ** np.float32(0.5)
-    light = image.max(-1)
+    light = brightest(image)
     result: np.ndarray = np.where((light < _DARK) | (light >= _BRIGHT), np.float32(1.08), np.float32(1)) * error
     return result

@@ -18,7 +18,7 @@ from densify.scale_file import MapScale, Scales
 from lightdepth.camera import CameraModel
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, brightest
 from lightdepth.light.known_length import KnownLength, weighed
 from lightdepth.light.looks import Look
 from lightdepth.light.millimetres import together
@@ -111,7 +111,7 @@ def reduced(frame: Frame, gamma: float) -> tuple[CameraModel, np.ndarray, np.nda
         return result
 
     image = mean(np.maximum(frame.image, 0) ** gamma) ** (1 / gamma)
-    image[mean(frame.image.max(-1) >= _WHITE) > 0] = 1
+    image[mean(brightest(frame.image) >= _WHITE) > 0] = 1
     return camera, image, mean(frame.valid) > 1 - 1e-6
 
 

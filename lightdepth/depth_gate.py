@@ -21,7 +21,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, brightest
 from lightdepth.ranges import at_least, checked
 
 _ROWS = 128  # at which frames are looked at
@@ -58,7 +58,7 @@ class Lit:
     def of(cls, frame: Frame) -> Lit:
         """Of the frame's valid pixels, at 128 rows."""
         height, width = frame.valid.shape
-        value: np.ndarray = np.ascontiguousarray(frame.image.max(-1), dtype=np.float32)
+        value: np.ndarray = np.ascontiguousarray(brightest(frame.image), dtype=np.float32)
         inside: np.ndarray = frame.valid.astype(np.float32)
         if height > _ROWS:
             size = max(1, round(width * _ROWS / height)), _ROWS

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lightdepth.camera import CameraModel
 from lightdepth.decline import BLUR, V_FLOOR, log_closed_form
-from lightdepth.frame import Frame, FrameBatch, to_batch
+from lightdepth.frame import Frame, FrameBatch, brightest, to_batch
 from lightdepth.geometry import normals_from_distance
 from lightdepth.network import DepthNetwork
 from lightdepth.photometry import brightness, decode, hue_saturation_albedo
@@ -135,9 +135,7 @@ def prediction_of(
 
 def _valid(frame: Frame) -> np.ndarray:
     """(H, W) bool: inside mask and lens, and not black."""
-    # A chain of comparisons is ten times as fast as the maximum over the last axis.
-    red, green, blue = (frame.image[..., channel] for channel in range(3))
-    result: np.ndarray = frame.valid & (np.maximum(np.maximum(red, green), blue) > V_FLOOR)
+    result: np.ndarray = frame.valid & (brightest(frame.image) > V_FLOOR)
     return result
 
 

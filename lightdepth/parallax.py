@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame
+from lightdepth.frame import Frame, brightest
 from lightdepth.observations import ObservedDistances, sample_distance
 from lightdepth.prediction import DepthPrediction
 from lightdepth.ranges import Range, above, at_least, checked
@@ -87,7 +87,7 @@ class Look(Brief):
     def of(cls, keyframe: Keyframe, frame: Frame, width: int) -> Look:
         """Of a keyframe and its frame, whose camera is the keyframe's."""
         image, valid, camera = frame.image, frame.valid, keyframe.camera
-        clear = image.max(2) < _SATURATED * max(float(image.max()), 1e-6)
+        clear = brightest(image) < _SATURATED * max(float(image.max()), 1e-6)
         gray: np.ndarray = (0.3 * image[..., 0] + 0.7 * image[..., 1]).astype(np.float32)
         if camera.width > width:
             size = (width, max(1, round(camera.height * width / camera.width)))
@@ -113,9 +113,10 @@ def textured(look: Look, config: ParallaxConfig) -> np.ndarray:
     for top, bottom in zip(rows[:-1], rows[1:], strict=True):
         for left, right in zip(columns[:-1], columns[1:], strict=True):
             cell = strength[top:bottom, left:right]
-            if cell.size and cell.max() > 0:
-                row, column = np.unravel_index(int(cell.argmax()), cell.shape)
-                found.append((left + column + 0.5, top + row + 0.5))
+            if cell.size:
+                row, column = divmod(int(cell.argmax()), cell.shape[1])
+                if cell[row, column] > 0:
+                    found.append((left + column + 0.5, top + row + 0.5))
     return np.array(found).reshape(-1, 2)
 
 
@@ -198,7 +199,8 @@ def _none(n: int) -> ObservedDistances:
 
 _STEP, _STEPS_EACH_WAY, _APART, _FALL_AT = 0.025, 24, 5, 6
 _MARGIN, _FALL = 0.1, 0.1
-_HYPOTHESES = _STEP * np.arange(-_STEPS_EACH_WAY, _STEPS_EACH_WAY + 1)
+HYPOTHESES = _STEP * np.arange(-_STEPS_EACH_WAY, _STEPS_EACH_WAY + 1)
+"""Log distances from the guess at which a patch is compared."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,7 @@ class _Sweep:
 
     @property
     def shape(self) -> tuple[int, int]:
-        return len(self.guess), len(_HYPOTHESES)
+        return len(self.guess), len(HYPOTHESES)
 
     @property
     def corners(self) -> list[int]:
@@ -230,7 +232,7 @@ class _Sweep:
         rays, inside = camera.unproject(three)
         known = inside.reshape(-1, 3).all(1) & (distance > 0).all(1)
         distance = np.where(known[:, None], distance, 1.0)
-        places = rays.reshape(-1, 1, 3, 3) * (distance[:, None] * np.exp(_HYPOTHESES)[:, None])[..., None]
+        places = rays.reshape(-1, 1, 3, 3) * (distance[:, None] * np.exp(HYPOTHESES)[:, None])[..., None]
         half = patch // 2
         grid = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), -1).reshape(-1, 2)
         own = _sampled(look.brightness, pixels[:, None] + grid)
@@ -284,4 +286,4 @@ def _best(score: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
     left, right = beside(-1), beside(1)
     bend = np.minimum(left - 2 * top + right, -1e-9)
     part = np.clip(0.5 * (left - right) / bend, -0.5, 0.5)
-    return _HYPOTHESES[index] + _STEP * part, speaks
+    return HYPOTHESES[index] + _STEP * part, speaks

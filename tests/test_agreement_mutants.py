@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_agreement import erring, errors, scene
 
-from densify.agreement import AgreementConfig, View, _overlap_rows, _pairs, _Places, _Rows, agree, gap_between
+from densify.agreement import AgreementConfig, View, _overlap_rows, _Places, _Rows, agree, compared_pairs, gap_between
 from densify.agreement import unbent as start
 from densify.bending import Bend, BendingConfig
 from densify.contradiction import ContradictionConfig, uncontradicted
@@ -103,7 +103,9 @@ def overlap_of(views: list[View], config: BendingConfig, w: np.ndarray) -> list[
     places = [_Places(v, b, agreement.samples) for v, b in zip(views, bends, strict=True)]
     none = np.zeros((0, w.shape[1]))
     points = [_Rows(np.full(5, 0.01), np.ones(5), {i: none}) for i in range(len(views))]
-    return _overlap_rows(views, bends, places, _pairs(np.full((len(views),) * 2, 9), len(views)), agreement, points)
+    return _overlap_rows(
+        views, bends, places, compared_pairs(np.full((len(views),) * 2, 9), len(views)), agreement, points
+    )
 
 
 def test_the_overlap_s_derivatives_are_those_of_differences_and_other_keyframes_move_nothing():

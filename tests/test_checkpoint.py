@@ -1,6 +1,8 @@
 import json
 import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -45,6 +47,16 @@ def test_loading_a_network_leaves_a_caller_s_own_chance_alone():
     torch.manual_seed(3)
     load_model(DEFAULT_CHECKPOINT)
     assert torch.equal(torch.rand(2), expected)
+
+
+def test_loading_a_network_does_not_load_pytorch_s_compiler():
+    """Which takes a second, and would be the longest part of the start of every verb that predicts."""
+    program = (
+        "import sys; from lightdepth.checkpoint import load_model; load_model('lightdepth-both'); "
+        "print('torch._dynamo' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False"]
 
 
 def test_half_precision_halves_the_file_and_rounds_by_a_thousandth(tmp_path):

@@ -10,7 +10,7 @@ from scenes import C3VD, ENDOMAPPER, LENSES, PINHOLE, cylinder, slanted_plane, s
 
 from lightdepth.camera import Pinhole
 from lightdepth.errors import InputError
-from lightdepth.frame import Frame, check_image_size, frame_number, to_batch
+from lightdepth.frame import Frame, brightest, check_image_size, frame_number, to_batch
 from lightdepth.photometry import PhotometricCalibration
 
 SMALL = Pinhole(8, 6, 6.0, 6.0, 4.0, 3.0)
@@ -39,6 +39,13 @@ def grey(camera=SMALL, value: float = 0.5, **more) -> Frame:
 )
 def test_the_number_of_a_frame_is_the_last_integer_of_its_stem(name, number):
     assert frame_number(name) == number
+
+
+def test_the_brightest_channel_is_the_maximum_over_channels_whatever_an_image_holds():
+    image = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
+    image[1, 2, 1], image[3, 3] = np.nan, (-np.inf, np.inf, 0)
+    np.testing.assert_array_equal(brightest(image), image.max(-1))
+    assert brightest(image).dtype == np.float32
 
 
 @pytest.mark.parametrize("name", ["mask.png", "", "seq_3/thumbnail.jpg", "video.mp4", "2024/"])

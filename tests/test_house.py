@@ -59,6 +59,7 @@ def verbs() -> Iterator[tuple[str, Callable[..., Any]]]:
     yield "bench estimators", bench.compare_estimators
     yield "bench per-frame", bench.compare_per_frame
     yield "bench completion", bench.compare_completions
+    yield "bench speed", bench.measure_speed
 
 
 def test_values_without_a_type_are_only_where_files_are_read_and_written():
@@ -125,7 +126,7 @@ PARSED_IN = {
     "zipfile.ZipFile": {"lightdepth.files.arrays", "lightdepth.files.weights"},
     "tarfile.open": {"lightdepth.datasets.scared_files", "lightdepth.datasets.scared_writing"},
     "msgpack.unpackb": {"lightdepth.maps.stella"},
-    "cv2.imread": set(),
+    "cv2.imread": {"densify.speed.stages"},  # of what it wrote itself, to be beside it in time
     "cv2.imdecode": {"lightdepth.files.images", "lightdepth.tube.sensor"},  # the second, of what it packed itself
     "Image.open": {"lightdepth.files.headers", "lightdepth.exporting.example"},  # the second is a script for others
     "av.open": {"lightdepth.datasets.video", "lightdepth.datasets.endomapper", "lightdepth.datasets.scared_writing"},

@@ -93,6 +93,7 @@ def test_every_command_of_the_pages_is_understood(command):
 
             ways = {"compare": bench.compare_runs, "estimators": bench.compare_estimators}
             ways |= {"per-frame": bench.compare_per_frame, "completion": bench.compare_completions}
+            ways |= {"speed": bench.measure_speed}
             name = words.pop(0) if words[0] in ways else ""
             function = ways.get(name, bench.run)
             parser = verb_parser(function, f"bench {name}".strip())

@@ -10,7 +10,15 @@ import pytest
 from raising import refused
 from scenes import Scene, cylinder, slanted_plane, sphere
 
-from densify.fusion.rectify import FULL, DirectionTable, RectifyConfig, SurfaceView, light_weight, surface_view
+from densify.fusion.rectify import (
+    FULL,
+    DirectionTable,
+    RectifyConfig,
+    SurfaceView,
+    _merge,
+    light_weight,
+    surface_view,
+)
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.prediction import DepthPrediction
 from lightdepth.tube import lens
@@ -139,6 +147,27 @@ def test_a_finer_image_is_merged_and_no_pixel_is_lost_by_it(camera):
     rows, columns = np.nonzero(scene.prediction().valid)
     of_pixel = rows // 3 * (camera.width + 1) + columns // 3
     assert np.isin(of_pixel, view.table.cells).mean() > 0.99 and known[of_pixel].mean() > 0.98
+
+
+def means_by_numpy(values: np.ndarray, valid: np.ndarray, size: int) -> np.ndarray:
+    """Sums of blocks by NumPy alone, along rows and then along columns."""
+    total, count = np.where(valid, values, 0).astype(np.float32), valid.astype(np.float32)
+    for axis in (0, 1):
+        starts = np.arange(0, valid.shape[axis], size)
+        total, count = (np.add.reduceat(a, starts, axis) for a in (total, count))
+    return total / np.maximum(count, 1)
+
+
+@pytest.mark.parametrize("size", [2, 3, 5, 8])
+@pytest.mark.parametrize("shape", [(57, 83), (64, 64), (3, 100)])
+def test_pixels_are_merged_in_the_order_of_numpy_s_sums_to_the_last_bit(size, shape):
+    rng = np.random.default_rng(size)
+    valid = rng.random(shape) < 0.7
+    valid[:size, :size] = False
+    colours = rng.random((*shape, 3)).astype(np.float32)
+    for values in (rng.normal(size=shape), colours[..., 1], rng.random(shape) < 0.5):
+        assert np.array_equal(_merge(values, valid, size), means_by_numpy(values, valid, size))
+    assert _merge(colours[..., 1], valid, size)[0, 0] == 0
 
 
 def test_a_pinhole_field_crops_a_fisheye_and_leaves_a_pinhole_whole():

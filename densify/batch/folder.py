@@ -65,20 +65,29 @@ def real_place(output: Path) -> Path:
 
 
 def begin(output: Path, arguments: Mapping[str, object]) -> None:
-    """Makes the output, or goes on with one that was begun with the same options. Raises InputError, naming what
-    differs, where it is of other ones, or not of this program."""
-    said = {"verb": "batch", "version": own_version(), "arguments": _as_it_is_known_again(arguments)}
+    """Makes the output, or goes on with one that was begun with the same options. Raises InputError as `is_begun`."""
+    if not is_begun(output, arguments):
+        output.mkdir(parents=True, exist_ok=True)
+        write_whole(output / BEGUN, json.dumps(_said(arguments), indent=1) + "\n")
+
+
+def is_begun(output: Path, arguments: Mapping[str, object]) -> bool:
+    """Whether the output was begun, with the same options. Raises InputError, naming what differs, where it is of other
+    ones, or not of this program."""
     if (output / BEGUN).is_file():
         begun = read_json(output / BEGUN)
         if not isinstance(begun, dict) or begun.get("verb") != "batch" or not isinstance(begun.get("arguments"), dict):
             raise InputError(output / BEGUN, "was not made by this program", "choose another -o")
-        _check_same(output, begun, said)
-        return
+        _check_same(output, begun, _said(arguments))
+        return True
     strangers = sorted(p.name for p in output.iterdir() if not hidden(p)) if output.is_dir() else []
     if strangers:
         raise InputError(output, f"holds {strangers[0]}, which is of no batch", "choose another -o")
-    output.mkdir(parents=True, exist_ok=True)
-    write_whole(output / BEGUN, json.dumps(said, indent=1) + "\n")
+    return False
+
+
+def _said(arguments: Mapping[str, object]) -> dict[str, object]:
+    return {"verb": "batch", "version": own_version(), "arguments": _as_it_is_known_again(arguments)}
 
 
 def check_ours(output: Path) -> None:

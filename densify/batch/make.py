@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import gc
-import io
 import json
-import sys
 import traceback
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from densify.batch.units import Unit
-from densify.dense_run import dense_run
+from densify.dense_run import dense_run, unheard
 from lightdepth.checkpoint import ModelSource
-from lightdepth.command_line.outcome import OUTCOME, Outcome
 from lightdepth.command_line.warned import warnings_as_sentences
 from lightdepth.errors import AlreadyFinished, InputError, InUse, PartialFailure
 from lightdepth.files.lock import is_live, lock_path
@@ -24,7 +20,7 @@ from lightdepth.files.machine import machine_failure
 from lightdepth.files.replacing import read_record
 from lightdepth.files.writing import write_whole
 from lightdepth.models import DepthModel
-from lightdepth.reporting.names import KEPT, Names
+from lightdepth.reporting.names import Names
 
 SEQUENCES, FAILED = "sequences", "failed"
 """Folders of an output: the run of each unit, and a record of each that failed."""
@@ -57,15 +53,7 @@ class Maker:
 
     def make(self, unit: Unit, model: DepthModel) -> Ended:
         """Makes a unit, and notes it where it failed."""
-        words = sys.argv
-        with ExitStack() as ending:
-            ending.callback(setattr, sys, "argv", words)
-            sys.argv = ["lightdepth", "batch"]  # a run notes them, and the rest may be names of patients
-            for variable, value in ((KEPT, self.keep_names), (OUTCOME, Outcome(quiet=True))):
-                ending.callback(variable.reset, variable.set(value))  # type: ignore[arg-type]  # each has its own type
-            ending.enter_context(warnings_as_sentences())
-            for redirected in (redirect_stdout, redirect_stderr):  # its log has it; what several say nobody can read
-                ending.enter_context(redirected(io.StringIO()))
+        with unheard(["lightdepth", "batch"], self.keep_names), warnings_as_sentences():
             return self._made(unit, model)
 
     def _made(self, unit: Unit, model: DepthModel) -> Ended:

@@ -13,9 +13,11 @@ from typing import Annotated, Literal
 from densify.batch.cluster import SlurmConfig, check_cluster, submitted
 from densify.batch.folder import JOBS, begin, check_ours, in_turn
 from densify.batch.make import TRIES, Ended, Maker, clear_locks, ended_before
+from densify.batch.planned import plan_batch
 from densify.batch.table import Line, line_of, summary, write_table
 from densify.batch.units import Unit, parsed_share, share_of
 from densify.batch.workers import Lost, pinned_threads, worked
+from lightdepth.command_line.dry import is_dry
 from lightdepth.command_line.outcome import is_quiet, outcome
 from lightdepth.counting import counted
 from lightdepth.errors import InputError, Interrupted
@@ -77,6 +79,8 @@ def check_running(running: Running) -> None:
 def batch_run(batch: Batch, running: Running) -> list[Line]:
     """Makes the units of a share that nobody has made, then the table of all units. Returns the lines of the share."""
     start, output = time.monotonic(), batch.output
+    if is_dry():
+        plan_batch(batch.units, output, batch.arguments, batch.maker.predicting, running.shard, running.jobs)
     share = share_of(batch.units, parsed_share(running.shard))
     with folders_for([output]), in_turn(output):
         begin(output, batch.arguments)

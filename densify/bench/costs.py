@@ -5,7 +5,7 @@ from __future__ import annotations
 from densify.bench.completion.scenes import completion_scenes
 from densify.bench.scenes import scenes
 from densify.bench.work import BenchConfig
-from densify.costs import keyframe_seconds
+from densify.costs import known_cost
 from lightdepth.command_line.dry import Step
 from lightdepth.counting import counted
 from lightdepth.judge_colons import JUDGE_COLONS
@@ -29,7 +29,7 @@ def bench_plan(config: BenchConfig) -> tuple[str, Work]:
     )
     width, height = config.image_size
     made = f"rendering {counted(keyframes, 'keyframe')}, and {fused} made dense, {width}x{height}"
-    return what, lambda: [Step(made, slowness() * (keyframes + fused) * keyframe_seconds(width, height))]
+    return what, lambda: [Step(made, known_cost().cost.of(keyframes + fused, width * height / 1e6, 0))]
 
 
 def per_frame_plan(models: int, rendered: bool, spoilt: bool) -> tuple[str, Work]:
@@ -50,5 +50,5 @@ def completion_plan(errors: int, image_size: tuple[int, int]) -> tuple[str, Work
     chosen = completion_scenes()
     keyframes = errors * sum(scene.keyframes for scene in chosen)
     what = f"{len(chosen)} colons, {counted(errors, 'map')} of each: {counted(keyframes, 'keyframe')} to be completed"
-    seconds = _COMPLETED * keyframes * keyframe_seconds(*image_size)
-    return what, lambda: [Step(f"completing {counted(keyframes, 'keyframe')} in every way", slowness() * seconds)]
+    step, megapixels = f"completing {counted(keyframes, 'keyframe')} in every way", image_size[0] * image_size[1] / 1e6
+    return what, lambda: [Step(step, known_cost().cost.of(_COMPLETED * keyframes, megapixels, 0))]

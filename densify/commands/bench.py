@@ -1,5 +1,5 @@
 """The verb bench: a run of the benchmark, `bench compare A B`, `bench estimators`, `bench per-frame`, `bench
-completion`. Thin: arguments in, files out."""
+completion`, `bench speed` (densify.commands.bench_speed). Thin: arguments in, files out."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from densify.bench.estimators import (
     estimators_tables,
     losses,
 )
+from densify.bench.files import write_json, write_tables
 from densify.bench.record import notes, read_bench, record, tables
 from densify.bench.scenes import Size, scenes
 from densify.bench.spoilt import SpoiltFrame, spoilt_frames, spoilt_tables
 from densify.bench.verdict import compare
 from densify.bench.work import IMAGE_SIZE, SHARES, BenchConfig, ModelSources, cells_of, load_models, predicted
+from densify.commands.bench_speed import measure_speed
 from densify.config import DensifyConfig, OfflineConfig, Recipe
-from densify.evaluation.page import tables_page
-from densify.evaluation.tables import Table
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, ModelSource
 from lightdepth.cli import parse
 from lightdepth.command_line.options import Group
@@ -60,7 +60,7 @@ from lightdepth.reporting.run import Run, plain, recorded, run_folder
 
 
 def bench(argv: list[str]) -> int:
-    """The built-in benchmark on synthetic colons; with compare, estimators, per-frame or completion another one."""
+    """The built-in benchmark on synthetic colons, or another one: compare, estimators, per-frame, completion, speed."""
     ways = _ways()
     if argv and argv[0] in ways:
         ways[argv[0]](**parse(ways[argv[0]], f"bench {argv[0]}", argv[1:]))
@@ -75,6 +75,7 @@ def _ways() -> dict[str, Callable[..., None]]:
         "estimators": compare_estimators,
         "per-frame": compare_per_frame,
         "completion": compare_completions,
+        "speed": measure_speed,
     }
 
 
@@ -97,7 +98,8 @@ def run(
     overwrite: bool = False,
     resume: bool = False,
 ) -> None:
-    """Synthetic colons made from seeds, judged row by row; also compare, estimators, per-frame, completion.
+    """Synthetic colons made from seeds, judged row by row; also compare, estimators, per-frame, completion,
+    speed.
 
     Args:
         output: Folder to make, with bench.json, bench.md, bench.png (error against coverage and by distance), and
@@ -150,13 +152,13 @@ def run(
         folder.begins(*bench_plan(config))
         cells, seconds = _cells(folder, config, models)
         found = record(config, cells, seconds)
-        _write_json(folder, "bench.json", found)
+        write_json(folder, "bench.json", found)
         picture = bench_picture(found["cells"])
         if picture is not None:
             (folder.folder / "bench.png").write_bytes(picture)
         caption = "Median error over the share of the truth that is met, and error by distance"
         pictures = [] if picture is None else [(picture, caption)]
-        _write_tables(folder, "bench", "Surfaces of synthetic colons", tables(found), notes(found), pictures)
+        write_tables(folder, "bench", "Surfaces of synthetic colons", tables(found), notes(found), pictures)
     end(output, then=f"lightdepth bench compare {quote(str(output))} OTHER", page=output / "report.html")
 
 
@@ -238,12 +240,12 @@ def compare_estimators(
         said = [*losses(records), NO_LIBRARY]
         unit = "shares of 1: |found scale / true scale - 1|"
         data = {"kind": "estimators", "unit": unit, "config": asdict(config), "records": records, "notes": said}
-        _write_json(folder, "estimators.json", data | {"versions": versions(), "revision": git_revision()})
+        write_json(folder, "estimators.json", data | {"versions": versions(), "revision": git_revision()})
         picture = estimators_picture(records)
         (folder.folder / "estimators.png").write_bytes(picture)
         pictures = [(picture, "Error of the scale by the share of wrong points")]
         title = "Estimators of a keyframe's scale"
-        _write_tables(folder, "estimators", title, estimators_tables(records), said, pictures)
+        write_tables(folder, "estimators", title, estimators_tables(records), said, pictures)
     end(output, then="lightdepth bench estimators -o OTHER --draws 200", page=output / "report.html")
 
 
@@ -292,11 +294,11 @@ def compare_per_frame(
                 rows += [per_frame.ColonFigures(**row) for row in folder.kept_of(colon.name)["clean"]]
                 bad += [SpoiltFrame(**row) for row in folder.kept_of(colon.name)["spoilt"]]
         found = per_frame.record(rows) | {"spoilt": [asdict(row) for row in bad], "versions": versions()}
-        _write_json(folder, "per-frame.json", found)
+        write_json(folder, "per-frame.json", found)
         write_image(folder.folder / "colons.png", per_frame.contact_sheet(sequences))
         pictures = [((folder.folder / "colons.png").read_bytes(), "A frame of each colon")]
         shown = [*per_frame.tables(rows), *spoilt_tables(bad)]
-        _write_tables(folder, "per-frame", "Depth of single frames", shown, [], pictures)
+        write_tables(folder, "per-frame", "Depth of single frames", shown, [], pictures)
     made = quote(str(output / "colons" if colons is None else colons))
     then = f"lightdepth bench per-frame -o OTHER --colons {made} --checkpoints '[CHECKPOINT]'"
     end(output, then=then, page=output / "report.html")
@@ -351,7 +353,7 @@ def compare_completions(
         folder.begins(*completion_plan(len(errors), image_size or SIZES[size]))
         cells, pictures = completed_cells(folder, model, config, errors, folders, inputs, image_size or SIZES[size])
         found = {**completion_record(cells), "config": config, "versions": versions(), "revision": git_revision()}
-        _write_json(folder, "completion.json", found)
+        write_json(folder, "completion.json", found)
         text = "\n".join(
             [*(t.markdown() for t in completion_tables(cells)), *(f"{n}\n" for n in completion_notes(cells))]
         )
@@ -362,24 +364,3 @@ def compare_completions(
         folder.log(text)
     then = "lightdepth bench completion -o OTHER --external '[NAME=FOLDER]'"
     end(output, then=then, page=output / "report.html")
-
-
-def _write_tables(
-    run: Run,
-    name: str,
-    title: str,
-    shown: Sequence[Table],
-    said: Sequence[str],
-    pictures: Sequence[tuple[bytes, str]],
-) -> None:
-    """Tables and the sentences below them as NAME.md, in the log, and with the pictures on a page."""
-    text = "\n".join([*(table.markdown() for table in shown), *(f"{line}\n" for line in said)])
-    (run.folder / f"{name}.md").write_text(text, encoding="utf-8", errors="backslashreplace")
-    page = tables_page(title, said, shown, pictures)
-    page.files(run.folder, {f"{name}.md": "the tables", f"{name}.json": "every figure, for programs"})
-    page.write(run.folder / "report.html")
-    run.log(text)
-
-
-def _write_json(run: Run, name: str, data: Mapping[str, object]) -> None:
-    (run.folder / name).write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -21,6 +21,7 @@ from densify.fusion.compiled import compiled
 from densify.fusion.second_core import halves
 from lightdepth.camera import CameraModel, Pinhole
 from lightdepth.errors import InputError
+from lightdepth.frame import brightest
 from lightdepth.prediction import DepthPrediction
 from lightdepth.ranges import SHARE, above, checked
 
@@ -126,7 +127,7 @@ def surface_view(
     if config.field == "pinhole":
         valid &= lens.in_pinhole
     distance = np.where(valid, prediction.distance, 1).astype(np.float32, copy=False)
-    light = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2]).astype(np.float32)
+    light = brightest(image).astype(np.float32)
     color, sigma = image, prediction.uncertainty
     kept = feathered(valid, config.feather)
     if share is not None:
@@ -258,12 +259,37 @@ def _halves(array: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _merge(values: np.ndarray, valid: np.ndarray, size: int) -> np.ndarray:
-    """Means (h, w) over the valid pixels of blocks of size x size, 0 where there are none; the last may be smaller."""
-    total, count = np.where(valid, values, 0).astype(np.float32), valid.astype(np.float32)
-    for axis in (0, 1):
-        starts = np.arange(0, valid.shape[axis], size)
-        total, count = (np.add.reduceat(a, starts, axis) for a in (total, count))
-    return total / np.maximum(count, 1)
+    """Means (h, w) float32 over the valid pixels of blocks of size x size, 0 where there are none; the last may be
+    smaller."""
+    height, width = (-(-side // size) for side in valid.shape)
+    means = np.empty((height, width), np.float32)
+    single = np.ascontiguousarray(values, np.float32)
+    halves(lambda first, end: _means(single, valid, size, first, end, means), height)
+    return means
+
+
+@compiled
+def _means(values: np.ndarray, valid: np.ndarray, size: int, first: int, end: int, means: np.ndarray) -> None:
+    """Rows first to end of the means of blocks. Each column of a block is summed, then the columns; of both, the first
+    comes last, which is the order of np.add.reduceat up to blocks of eight."""
+    height, width = valid.shape
+    zero, one = np.float32(0), np.float32(1)
+    sums, counts = np.empty(width, np.float32), np.empty(width, np.float32)
+    for row in range(first, end):
+        top, bottom = row * size, min(row * size + size, height)
+        sums[:], counts[:] = zero, zero
+        for y in range(bottom - top):
+            line = top + (y + 1) % (bottom - top)
+            for x in range(width):  # choices instead of branches: so columns are summed eight at a time
+                sums[x] += values[line, x] if valid[line, x] else zero
+                counts[x] += one if valid[line, x] else zero
+        for column in range(means.shape[1]):
+            left, right = column * size, min(column * size + size, width)
+            rest, count = zero, counts[left]
+            for x in range(left + 1, right):
+                rest += sums[x]
+                count += counts[x]
+            means[row, column] = (sums[left] + rest) / (count if count > one else one)
 
 
 @compiled

@@ -14,8 +14,8 @@ from lightdepth.command_line.heartbeat import duration
 
 VERBS = frozenset(
     {
-        *("import", "train", "adapt", "predict", "sparse", "densify", "live"),
-        *("bench", "bench per-frame", "bench completion"),
+        *("import", "train", "adapt", "predict", "sparse", "densify", "batch", "live"),
+        *("bench", "bench per-frame", "bench completion", "bench speed"),
     }
 )
 DRY: ContextVar[bool] = ContextVar("dry", default=False)

@@ -174,6 +174,12 @@ PAGES = {
             "lightdepth bench completion -o runs/beside --external '[mine=runs/mine]'",
         )
     ),
+    "bench speed": Page(
+        (
+            "lightdepth bench speed -o runs/speed",
+            "lightdepth bench speed -o runs/large --image-sizes '[[1440, 1080]]' --seconds 3",
+        )
+    ),
     "scale": Page(
         (
             "lightdepth scale runs/dense --light light.json",

@@ -92,6 +92,13 @@ def network_outputs(raw: Tensor, log_closed: Tensor, mask: Tensor, output: str) 
     return log_distance.clamp(-_LOG_LIMIT, _LOG_LIMIT).exp(), raw[:, 1:].float().sigmoid()
 
 
+def draw_small(weights: Tensor) -> None:
+    """Draws weights about 0, a thousandth off. On the device `meta`, where there are none to draw, it does
+    nothing: PyTorch would load its compiler for that, which takes seconds."""
+    if not weights.is_meta:
+        nn.init.normal_(weights, std=1e-3)
+
+
 class UncertaintyHead(nn.Module):
     """(B, channels, h, w) -> log sigma (B, 1, h, w). It reads features and never changes them.
 
@@ -111,7 +118,7 @@ class UncertaintyHead(nn.Module):
         )
         last = self.layers[-1]
         assert isinstance(last, nn.Conv2d) and last.bias is not None
-        nn.init.normal_(last.weight, std=1e-3)
+        draw_small(last.weight)
         nn.init.constant_(last.bias, -2.0)  # 13 %, about what the closed form errs by
         self.register_buffer("calibration", torch.tensor([1.0, 0.0]))
 

@@ -19,6 +19,7 @@ from lightdepth.network.heads import (
     OUTPUTS,
     ClosedForm,
     UncertaintyHead,
+    draw_small,
     input_channels,
     network_inputs,
     network_outputs,
@@ -156,7 +157,7 @@ class DepthNetwork(nn.Module):
         else:
             self.body = DPT(inputs, outputs, config.encoder or "")
         # Training starts from the closed form (residual) or a flat distance, and a grey albedo.
-        nn.init.normal_(self.body.head.weight, std=1e-3)
+        draw_small(self.body.head.weight)
         assert self.body.head.bias is not None
         nn.init.zeros_(self.body.head.bias)
         self.uncertainty = UncertaintyHead(self.body.channels + inputs + 1) if config.uncertainty else None
