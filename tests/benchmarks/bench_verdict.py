@@ -47,7 +47,7 @@ LENSES = ("c3vd", "fisheye", "pinhole")
 FULL = DensifyConfig()
 SCALED = replace(FULL.rigid(), judge=JudgeConfig(on=False))
 UNBRAKED = replace(FULL, judge=JudgeConfig(on=False))
-DEFAULT, CLOSED = DEFAULT_CHECKPOINT, "decline"
+OURS, CLOSED = DEFAULT_CHECKPOINT, "decline"
 
 
 NO_ERRORS = MapErrors()
@@ -77,26 +77,26 @@ def side(share: float, factor: float) -> MapErrors:
 
 
 CASES = (
-    *(Case(i, m, "clean") for i, m in ((0, DEFAULT), (1, CLOSED), (2, DEFAULT), (3, DEFAULT), (4, CLOSED), (5, DEFAULT))),
+    *(Case(i, m, "clean") for i, m in ((0, OURS), (1, CLOSED), (2, OURS), (3, OURS), (4, CLOSED), (5, OURS))),
     *(Case(i, m, f"side 30 % x{f}", side(0.3, f)) for f, (i, m) in zip(
-        (1.05, 1.1, 1.15, 1.3, 1.5, 1.1, 1.15, 1.3, 1.5), ((0, DEFAULT), (1, DEFAULT), (2, CLOSED), (3, CLOSED), (4, DEFAULT),
-        (5, CLOSED), (0, CLOSED), (1, CLOSED), (2, DEFAULT)), strict=True)),
+        (1.05, 1.1, 1.15, 1.3, 1.5, 1.1, 1.15, 1.3, 1.5), ((0, OURS), (1, OURS), (2, CLOSED), (3, CLOSED), (4, OURS),
+        (5, CLOSED), (0, CLOSED), (1, CLOSED), (2, OURS)), strict=True)),
     *(Case(i, m, f"side 45 % x{f}", side(0.45, f)) for f, (i, m) in zip(
-        (1.1, 1.15, 1.3, 1.5, 1.3, 1.15), ((3, DEFAULT), (4, DEFAULT), (5, DEFAULT), (0, DEFAULT), (1, CLOSED), (2, CLOSED)),
+        (1.1, 1.15, 1.3, 1.5, 1.3, 1.15), ((3, OURS), (4, OURS), (5, OURS), (0, OURS), (1, CLOSED), (2, CLOSED)),
         strict=True)),
-    *(Case(i, m, "fold 20 %", MapErrors(fold_share=0.2)) for i, m in ((3, DEFAULT), (4, CLOSED))),
-    *(Case(i, m, "poses drift", MapErrors(pose_drift=0.1, pose_drift_deg=5.0)) for i, m in ((5, DEFAULT), (0, DEFAULT))),
+    *(Case(i, m, "fold 20 %", MapErrors(fold_share=0.2)) for i, m in ((3, OURS), (4, CLOSED))),
+    *(Case(i, m, "poses drift", MapErrors(pose_drift=0.1, pose_drift_deg=5.0)) for i, m in ((5, OURS), (0, OURS))),
     *(Case(i, m, "poses drift, points follow", MapErrors(pose_drift=0.1, pose_drift_deg=5.0, points_follow=True))
-      for i, m in ((1, DEFAULT), (2, DEFAULT))),
-    *(Case(i, m, "30 % independent", independent=True) for i, m in ((3, CLOSED), (4, DEFAULT))),
-    *(Case(i, m, "few points", few=True) for i, m in ((5, CLOSED), (0, DEFAULT))),
-    *(Case(i, m, "two frames late", late=2) for i, m in ((1, DEFAULT), (3, DEFAULT))),
-    *(Case(i, m, "ten frames late", late=10) for i, m in ((2, DEFAULT), (4, DEFAULT))),
+      for i, m in ((1, OURS), (2, OURS))),
+    *(Case(i, m, "30 % independent", independent=True) for i, m in ((3, CLOSED), (4, OURS))),
+    *(Case(i, m, "few points", few=True) for i, m in ((5, CLOSED), (0, OURS))),
+    *(Case(i, m, "two frames late", late=2) for i, m in ((1, OURS), (3, OURS))),
+    *(Case(i, m, "ten frames late", late=10) for i, m in ((2, OURS), (4, OURS))),
     *(Case(i, m, "light of gamma 5", gamma=5.0) for i, m in ((5, CLOSED), (0, CLOSED))),
-    *(Case(i, m, "white frames", white=True) for i, m in ((1, DEFAULT), (2, CLOSED))),
+    *(Case(i, m, "white frames", white=True) for i, m in ((1, OURS), (2, CLOSED))),
     Case(3, "constant", "constant distance"),
 )  # fmt: skip
-APART = tuple(Case(i, DEFAULT, "scale drift 1.3", MapErrors(drift=1.3)) for i in (0, 1, 2, 3))
+APART = tuple(Case(i, OURS, "scale drift 1.3", MapErrors(drift=1.3)) for i in (0, 1, 2, 3))
 
 
 @cache
