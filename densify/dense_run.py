@@ -55,7 +55,8 @@ def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = F
         run.hash_inputs(**source.files, map=mapped.map, checkpoint=Path(asked.predicting.checkpoint))
         sparse_map, frames = map_and_frames(run, source, mapped, asked.sfm)
         doubts = doubts_of_inputs(run, sparse_map, frames)
-        run.begins(surfaces_of(sparse_map, frames), partial(surface_steps, sparse_map, frames, model, asked.fit_light))
+        steps = partial(surface_steps, sparse_map, frames, model, asked.fit_light, mapped.polish_map)
+        run.begins(surfaces_of(sparse_map, frames), steps)
         frames = fitted_light(run, frames, sparse_map, model, config, asked.fit_light)
         work = Densified.make(frames, sparse_map, model, config, asked.merging if asked.merge else None, run)
         work.doubts = doubts
