@@ -78,7 +78,11 @@ TOLD = {
     "densify a polished map": ["polishing the poses of 10 keyframes", "predicting 10 keyframes by decline: about"],
     "live": ["2 submaps with 10 keyframes", "10 keyframes: about"],
     "sparse": ["8 frames would be mapped", "features of 8 frames: about"],
-    "sparse without a camera": ["8 frames, 96x80, whose camera is found first", "cannot be told"],
+    "sparse without a camera": [
+        "8 frames, 96x80, whose camera is found first",
+        "by the motion of 8 frames",
+        "cannot be told",
+    ],
     "import": ["8 frames would be measured", "measuring 8 frames: about"],
     "adapt": ["to learn from", "a map of 2 submaps", "5 steps of 2 frames: about"],
     "train": [
