@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from colons import CAMERA, colon
 from raising import refused
 from sequences import asked_of_all
 
@@ -14,7 +15,10 @@ import densify.batch.units as batch_units
 from densify.batch.manifest import Row, read_manifest
 from densify.batch.units import Unit, parsed_share, share_of
 from densify.inputs import MapSource
+from lightdepth.datasets import write_c3vd, write_simcol
 from lightdepth.datasets.extent import Extent, digits_of, extent_of
+from lightdepth.datasets.reading import image_files
+from lightdepth.tube import lens
 
 
 def pictures(folder: Path, count: int, size: tuple[int, int] = (8, 6), first: int = 9) -> Path:
@@ -139,3 +143,11 @@ def test_a_file_for_all_sequences_that_cannot_be_read_is_refused_before_any_work
     with refused("banana"):
         batch_units.check_contents_of_all(asked_of_all(light="gamma=banana").source, units)
     batch_units.check_contents_of_all(asked_of_all(light="gamma=2.2,mu=0", camera=Path("auto")).source, units)
+
+
+@pytest.mark.parametrize("write", [write_c3vd, write_simcol])
+def test_pictures_of_the_truth_among_the_frames_are_no_frames(tmp_path, write):
+    write(colon(0, 3, 6.0, lens("c3vd", 50, 40) if write is write_c3vd else CAMERA).frames, tmp_path / "Frames_S1")
+    assert extent_of(tmp_path / "Frames_S1").frames == 3
+    names = image_files(tmp_path / "Frames_S1").values()
+    assert len(names) == 3 and all("color" in name or "FrameBuffer" in name for name in names)
