@@ -148,6 +148,14 @@ def test_it_is_refused_as_the_real_run_is(broken, data, tmp_path, capsys):
     assert dry[0] == real[0] == 3 and refusals[0] == refusals[1] != []
 
 
+def test_that_the_light_will_tell_no_millimetres_is_known_before_the_work(data, tmp_path, capsys):
+    given = ["densify", data, "--map", data / "slam", *DECLINE, "--mm-per-unit", "light", "-o", tmp_path / "out"]
+    assert lightdepth(*given, "--light", "gamma=2.2,mu=0", "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert "warning: surfaces will be in map units: the light is said to sit in the camera" in said
+    assert lightdepth(*given, "--dry-run") == 0 and "will be in map units" not in capsys.readouterr().out
+
+
 def write_unfinished(folder: Path, verb: str) -> None:
     """What a run that was killed left, with a finished part."""
     from lightdepth.reporting.unfinished import Part, add_part, begin
