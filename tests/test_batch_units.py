@@ -60,6 +60,23 @@ def test_sequences_are_found_three_folders_down_and_results_and_what_is_hidden_a
     assert found == ["a", "b/c", "b/d"]
 
 
+def test_links_in_a_circle_and_to_a_folder_above_stop_nothing_and_make_no_sequence_twice(tmp_path):
+    root = tmp_path / "data"
+    pictures(root / "a", 2), pictures(tmp_path / "elsewhere" / "b", 2), (root / "c").mkdir()
+    for link, to in {
+        "circle.csv": "circle.csv",
+        "c/up": "..",
+        "here": ".",
+        "b": "../elsewhere/b",
+        "gone": "no",
+    }.items():
+        (root / link).symlink_to(to)
+    found = [row.data.relative_to(root).as_posix() for row in read_manifest(root, tmp_path / "out")]
+    assert found == ["a", "b"]
+    matched = read_manifest(Path(f"{root}/*"), tmp_path / "out")
+    assert {"a", "b"} <= {row.data.name for row in matched}
+
+
 def test_the_digits_of_a_sequence_follow_its_frames_and_not_its_place(tmp_path):
     one, same = pictures(tmp_path / "one", 5), pictures(tmp_path / "elsewhere" / "same", 5)
     assert extent_of(one) == extent_of(same) == Extent(5, 8, 6, extent_of(one).digits)

@@ -83,7 +83,7 @@ def _may_be_one(path: Path, output: Path) -> bool:
     """Whether what a pattern matches may be a sequence: no result of a run, and no file but a video."""
     if path.is_file():
         return video_at(path) is not None
-    return not is_result(path) and path.resolve() != output
+    return not is_result(path) and os.path.realpath(path) != str(output)
 
 
 def _rows_of_table(table: Path) -> list[Row]:
