@@ -143,14 +143,15 @@ def surfaces_of(sparse_map: SparseMap, frames: FrameSequence) -> str:
 
 
 def surface_steps(
-    sparse_map: SparseMap, frames: FrameSequence, model: DepthModel, fit_light: bool = False
+    sparse_map: SparseMap, frames: FrameSequence, model: DepthModel, fit_light: bool = False, polish: bool = False
 ) -> list[Step]:
-    """Prediction, the light where it is to be found, and the surfaces."""
+    """The poses where they are polished, prediction, the light where it is to be found, and the surfaces."""
     keyframes = [k for s in sparse_map.submaps for k in s.keyframes if k.number in frames.numbers]
     count, camera = len(keyframes), keyframes[0].camera
     some = dict.fromkeys(frames.numbers.index(k.number) for k in keyframes[:5])
     each = seconds_each(frames.at(list(some)), model)
-    steps = [Step(f"predicting {counted(count, 'keyframe')} by {model.name}", times(count, each))]
+    steps = [Step(f"polishing the poses of {counted(count, 'keyframe')}")] * polish
+    steps.append(Step(f"predicting {counted(count, 'keyframe')} by {model.name}", times(count, each)))
     if fit_light and frames.first().light.assumed:
         steps.append(Step("finding the light on the map, at the most", times(min(_LIGHT, 3 * count), each)))
     known = known_cost()

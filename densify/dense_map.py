@@ -38,14 +38,15 @@ _FAR = 16  # times its size, twice the distance from the origin: from there on i
 
 class Surface:
     """A mesh that rays can be cast at: vertices (n, 3), triangles (m, 3). In single precision, about its own middle
-    where it is far from the origin."""
+    where it is far from the origin. `diagonal` is that of the box around it, 0 where it is empty."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
         self._core = native.open3d().core
         self._scene = native.open3d().t.geometry.RaycastingScene() if len(triangles) else None
-        self._middle = np.zeros(3)
+        self._middle, self.diagonal = np.zeros(3), 0.0
         if self._scene is not None:
             low, high = vertices.min(0), vertices.max(0)
+            self.diagonal = float(np.linalg.norm(high - low))
             if np.abs(low + high).max() > _FAR * np.ptp(vertices, axis=0).max():
                 self._middle = (low + high) / 2
             faces = self._core.Tensor(triangles.astype(np.uint32))

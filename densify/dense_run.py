@@ -21,8 +21,10 @@ from densify.scale_file import MmPerUnit
 from lightdepth.calibration import read_light
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.outcome import OUTCOME, Outcome
-from lightdepth.datasets import SequenceSource
+from lightdepth.datasets import FrameSequence, SequenceSource
+from lightdepth.light.millimetres import unplaced
 from lightdepth.models import DepthModel
+from lightdepth.photometry import PhotometricCalibration
 from lightdepth.reporting.names import KEPT
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.sfm.config import SfmConfig
@@ -61,17 +63,18 @@ def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = F
     with run_folder(output, "densify", arguments, overwrite, resume) as run:
         run.hash_inputs(**source.files, map=mapped.map, checkpoint=Path(asked.predicting.checkpoint))
         sparse_map, frames = map_and_frames(run, source, mapped, asked.sfm)
+        if files.mm_per_unit == "light" and (untold := unplaced(_light_given(source, frames))) is not None:
+            run.warn(f"surfaces will be in map units: {untold.refused}; {untold.cure}")
         doubts = doubts_of_inputs(run, sparse_map, frames)
-        run.begins(surfaces_of(sparse_map, frames), partial(surface_steps, sparse_map, frames, model, asked.fit_light))
+        steps = partial(surface_steps, sparse_map, frames, model, asked.fit_light, mapped.polish_map)
+        run.begins(surfaces_of(sparse_map, frames), steps)
         frames = fitted_light(run, frames, sparse_map, model, config, asked.fit_light)
         work = Densified.make(frames, sparse_map, model, config, asked.merging if asked.merge else None, run)
         work.doubts = doubts
         told = files.mm_per_unit
         mm_per_unit: MmPerUnit
         if told == "light":
-            # As the file has it: a light that was given by hand counts as given, also where its file says assumed.
-            light = frames.first().light if source.light is None else read_light(source.light)
-            mm_per_unit = work.ask_light(run, frames, light, files.wall_mm)
+            mm_per_unit = work.ask_light(run, frames, _light_given(source, frames), files.wall_mm)
         else:
             mm_per_unit = told
         work.write(run, files.formats, mm_per_unit)
@@ -102,3 +105,8 @@ def unheard(words: Sequence[str], keep_names: bool = False) -> Iterator[None]:
         for redirected in (redirect_stdout, redirect_stderr):
             ending.enter_context(redirected(io.StringIO()))
         yield
+
+
+def _light_given(source: SequenceSource, frames: FrameSequence) -> PhotometricCalibration:
+    """As its file has it: a light that was given by hand counts as given, also where its file says assumed."""
+    return frames.first().light if source.light is None else read_light(source.light)

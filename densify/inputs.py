@@ -143,7 +143,9 @@ def _say_localised(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> No
 
 def polished(run: Run, sparse_map: SparseMap) -> SparseMap:
     """The map with the poses that its points bear out; submaps of which one moved are written to polished/ in the run
-    folder, as COLMAP models."""
+    folder, as COLMAP models. A dry run leaves the map as it is."""
+    if run.plan is not None:
+        return sparse_map
     submaps, told = [], []
     for submap in sparse_map.submaps:
         new, polish = polished_submap(submap)

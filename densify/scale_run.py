@@ -31,12 +31,12 @@ class LengthGiven:
 
     ends: Annotated[list[tuple[float, float, float]] | None, ANY] = None
     """Two places in the coordinates of a map's surface, map units, [[x, y, z], [x, y, z]], whose straight distance is
-    known. Another pair is of another length."""
+    known; on the surface or near it (`measure` says where it is). Another pair is of another length."""
     mm: Annotated[float | None, above(0)] = None
     """Their distance, mm. A longer one makes the map larger in proportion."""
     error_mm: Annotated[float | None, above(0)] = None
-    """Standard error of that distance, mm, of the places too; left out, a tenth of it. A larger one gives the light
-    more weight beside it."""
+    """Standard error of that distance, mm, of the places too, below it; left out, a tenth of it. A larger one gives the
+    light more weight beside it."""
     map: Annotated[int | None, at_least(0)] = None
     """Number of the map that the places are on, as in the name of its folder; needed where the run has several. Another
     one gives that map's unit."""
@@ -88,7 +88,10 @@ class ScaleAsked:
         maps = tuple(one for one in map(_seen, folders) if one is not None)
         if not maps:
             raise InputError(run, "no surface in it that is not empty", "expected one at least")
-        return cls(run, maps, light, data, wall_mm, length.known([one.id for one in maps], run))
+        known = length.known([one.id for one in maps], run)
+        if known is not None:
+            maps[known.map].check_near(np.array(length.ends, float))
+        return cls(run, maps, light, data, wall_mm, known)
 
     def length_record(self, given: LengthGiven) -> dict[str, object] | None:
         """The length for scale.json, with what was left out of it; None where none was given."""

@@ -32,6 +32,9 @@ _WHITE = 0.98  # V of a pixel that the sensor may have clipped
 _SURFACE = 0.1
 """Deviation of the logarithm of a scale by what is wrong with a fused surface and a map's poses: with it errors on five
 tuning colons are as large as stated (docs/millimetres.md)."""
+_OFF = 0.25
+"""How far from a map's surface a place on it may be said to be, as a share of the surface's diagonal: a tool before the
+wall may be, places of another map or in another unit are not."""
 WALL_MM = 30.0
 """Where the wall usually is: from .4 to 2.5 times as far a scale is looked for."""
 
@@ -47,6 +50,18 @@ class SeenMap:
     @classmethod
     def of(cls, dense: DenseMap) -> SeenMap:
         return cls(dense.submap.id, dense.surface, tuple(dense.aligned_keyframes))
+
+    def check_near(self, places: np.ndarray) -> None:
+        """Raises InputError where one of places (n, 3) is nowhere near the surface."""
+        found = self.surface.closest(places)[0]
+        off, across = np.linalg.norm(found - places, axis=1), self.surface.diagonal
+        if (off > _OFF * across).any():
+            worst = int(off.argmax())
+            raise InputError(
+                f"--length.ends {np.round(places[worst], 4).tolist()}",
+                f"it is {off[worst]:.3g} from the surface of map {self.id}, whose diagonal is {across:.3g}",
+                f"the nearest place on it is {np.round(found[worst], 4).tolist()}",
+            )
 
     def distance(self, keyframe: Keyframe, camera: CameraModel) -> np.ndarray:
         """Distance (H, W) to the surface along the pixels' rays, 0 where none is met."""

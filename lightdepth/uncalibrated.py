@@ -90,7 +90,10 @@ def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = No
         stand_in = folder / "camera.json"
         write_camera(across(width, height, source.fov or 70.0), stand_in)
         frames = replace(source, camera=stand_in, fov=None).open().without_truth()
-        run.begins(f"{counted(len(frames), 'frame')}, {width}x{height}, whose camera is found first", _search)
+        run.begins(
+            f"{counted(len(frames), 'frame')}, {width}x{height}, whose camera is found first",
+            lambda: _search(len(frames)),
+        )
         try:
             found = _found(frames, source.fov, run, config)
         except InputError as error:
@@ -111,8 +114,8 @@ def found_camera(source: SequenceSource, run: Run, config: SfmConfig | None = No
     return replace(found.camera, provenance=Provenance("self-calibrated", round(found.deviation, 5), str(found)))
 
 
-def _search() -> list[Step]:
-    return [Step(f"finding the camera by the motion of {FRAMES} frames, then all else")]
+def _search(count: int) -> list[Step]:
+    return [Step(f"finding the camera by the motion of {counted(min(count, FRAMES), 'frame')}, then all else")]
 
 
 def _assumed(run: Run, size: tuple[int, int], fov: float, why: str) -> CameraModel:

@@ -98,7 +98,7 @@ VERBS = (
         "scale",
         (
             *("scale", "dense", "-o", "out", "--length.map", "0", "--length.mm", "5"),
-            *("--length.ends", "[[0, 0, 1], [0, 0, 2]]", "--light", "gamma=2.2,mu=0"),
+            *("--length.ends", "[[1.2, -0.4, 3.1], [1.2, -0.4, 2.6]]", "--light", "gamma=2.2,mu=0"),
         ),
         "out",
         ("--length.mm", "6"),

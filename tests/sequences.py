@@ -13,17 +13,29 @@ from typing import Any
 
 from colons import colon, slam
 
+from densify.config import DensifyConfig
 from densify.dense_run import Asked
+from densify.inputs import MapSource, SurfaceFiles
+from densify.joining import MergeConfig
+from lightdepth.checkpoint import ModelSource
 from lightdepth.cli import main
-from lightdepth.datasets import open_sequence
+from lightdepth.datasets import SequenceSource, open_sequence
 from lightdepth.errors import InputError
 from lightdepth.maps import read_map
 from lightdepth.models import DepthModel
 from lightdepth.reporting.run import recorded, run_folder
+from lightdepth.sfm.config import SfmConfig
 from lightdepth.tube.export import write_synthetic
 
 QUICK = ("--map", "slam", "--checkpoint", "decline", "--judge.no-on", "--no-fit-light")
 """Of everything that is left out the answer is not asked for here."""
+
+
+def asked_of_all(**source: Any) -> Asked:
+    """What a command line asks of all sequences that says no more than this."""
+    given = SequenceSource(Path("manifest"), **source)
+    config, files = DensifyConfig(), SurfaceFiles()
+    return Asked(given, MapSource(), ModelSource("decline"), config, SfmConfig(), files, True, True, MergeConfig())
 
 
 def made_sequences(root: Path, count: int, name: str = "case_{:02d}") -> list[Path]:

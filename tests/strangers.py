@@ -32,11 +32,15 @@ from parsers import PARSERS, around, parser
 from PIL import Image
 from safetensors.torch import save
 from scipy.io import savemat
+from sequences import asked_of_all
 from videos import write_video
 
+from densify.batch.manifest import read_manifest
+from densify.batch.units import units_of
 from densify.bench.record import BenchFile
 from densify.dense_map import run_record
 from densify.evaluation.depth_files import DepthReading
+from densify.scale_file import MapScale, Scales, scale_of
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.checkpoint import load_model, save_model
@@ -353,6 +357,18 @@ def _(folder: Path) -> list[str]:
     return ["frames.txt"]
 
 
+@parser("table of sequences", lambda path: units_of(read_manifest(path, path.parent / "out"), asked_of_all()))
+def _(folder: Path) -> list[str]:
+    write_folder(frames(), folder / "a")
+    text_model(folder / "map")
+    rows = "data,map,light,mm_per_unit,name,camera,mask,fov,trust_map,map_fps\n"
+    rows += 'a,map,"gamma=2.2,mu=0",3.1,case-1,,,,,\n./a,,a/light.json,light,,auto,a/m.png,90,true,30\n"b",,,,,,,,,\n'
+    (folder / "commas.csv").write_text(rows)
+    (folder / "semicolons.csv").write_text("\ufeffdata;name;;\r\na;x;;\r\n\r\n;;;\r\n")
+    (folder / "tabs.tsv").write_text("data\tformat\tbit-depth\na\tfolder\t10\n")
+    return ["commas.csv", "semicolons.csv", "tabs.tsv"]
+
+
 # ---- pictures, videos, depth
 
 
@@ -564,3 +580,10 @@ def _(folder: Path) -> list[str]:
 def _(folder: Path) -> list[str]:
     (folder / "run.json").write_text(json.dumps({"verb": "export", "step": 0.1, "unit": "mm", "arguments": {}}))
     return ["run.json"]
+
+
+@parser("scale.json", lambda path: scale_of(path.parent, 0), handed_in=False)
+def _(folder: Path) -> list[str]:
+    told = MapScale(0, 2.0, (1.6, 2.5), "the light", 0.1, 900), MapScale(1, refused="it is dark", cure="more light")
+    Scales(told).write_file(folder, "map units", PhotometricCalibration())
+    return ["scale.json"]

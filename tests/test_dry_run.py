@@ -58,6 +58,7 @@ def words_of(verb: str, data: Path, frames: Path) -> list[object]:
         "densify without a map": ["densify", frames, *DECLINE],
         "densify a map made anew": ["densify", data, "--map", data / "slam", "--repair-map", "true", *DECLINE],
         "batch": ["batch", data.parent, "--map", "slam", "--jobs", "2", *DECLINE],
+        "densify a polished map": ["densify", data, "--map", data / "slam", "--polish-map", "true", *DECLINE],
         "live": ["live", data, "--map", data / "slam", *DECLINE],
         "sparse": ["sparse", frames],
         "sparse without a camera": ["sparse", frames, "--camera", "auto"],
@@ -77,9 +78,14 @@ TOLD = {
     "densify without a map": ["8 frames would be mapped by pycolmap", "28 pairs", "what follows"],
     "densify a map made anew": ["the map of 10 keyframes would be made anew first"],
     "batch": ["1 sequence, none of them already made", "predicting about 10 keyframes", "those of 1 sequence"],
+    "densify a polished map": ["polishing the poses of 10 keyframes", "predicting 10 keyframes by decline: about"],
     "live": ["2 submaps with 10 keyframes", "10 keyframes: about"],
     "sparse": ["8 frames would be mapped", "features of 8 frames: about"],
-    "sparse without a camera": ["8 frames, 96x80, whose camera is found first", "cannot be told"],
+    "sparse without a camera": [
+        "8 frames, 96x80, whose camera is found first",
+        "by the motion of 8 frames",
+        "cannot be told",
+    ],
     "import": ["8 frames would be measured", "measuring 8 frames: about"],
     "adapt": ["to learn from", "a map of 2 submaps", "5 steps of 2 frames: about"],
     "train": [
@@ -146,6 +152,14 @@ def test_it_is_refused_as_the_real_run_is(broken, data, tmp_path, capsys):
     real = lightdepth(*given), capsys.readouterr().err
     refusals = [[line for line in said.splitlines() if line.startswith("lightdepth ")] for said in (dry[1], real[1])]
     assert dry[0] == real[0] == 3 and refusals[0] == refusals[1] != []
+
+
+def test_that_the_light_will_tell_no_millimetres_is_known_before_the_work(data, tmp_path, capsys):
+    given = ["densify", data, "--map", data / "slam", *DECLINE, "--mm-per-unit", "light", "-o", tmp_path / "out"]
+    assert lightdepth(*given, "--light", "gamma=2.2,mu=0", "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert "warning: surfaces will be in map units: the light is said to sit in the camera" in said
+    assert lightdepth(*given, "--dry-run") == 0 and "will be in map units" not in capsys.readouterr().out
 
 
 def write_unfinished(folder: Path, verb: str) -> None:

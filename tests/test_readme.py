@@ -23,7 +23,7 @@ from lightdepth.tube.export import write_synthetic
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
-TAUGHT = ("video-to-surface", "batch", "training", "evaluation", "measuring", "exporting")
+TAUGHT = ("video-to-surface", "batch", "millimetres", "training", "evaluation", "measuring", "exporting")
 PAGES = "\n".join([*((ROOT / "docs" / f"{name}.md").read_text() for name in TAUGHT), README])
 BLOCKS = re.split(r"^```.*$", PAGES, flags=re.MULTILINE)[1::2]
 LINES = [line for block in BLOCKS for line in block.splitlines() if line.startswith("lightdepth ")]
@@ -37,7 +37,7 @@ MINUTES = (
 )
 """Commands that take minutes: what they do is tested in modules of their own."""
 OTHER_DATA = ("--suite", "calib_results.txt", "--join", "joined_000", "lightdepth select", "--data.frames", "runs/self")
-OTHER_DATA += ("densify DATA", "lightdepth batch", "calibrate-light BOARD")
+OTHER_DATA += ("densify DATA", "lightdepth batch", "lightdepth scale", "--mm-per-unit light", "calibrate-light BOARD")
 """Commands on data that the colon does not give (its small frames do not match); likewise."""
 
 OPEN_ENDED = ("view",)

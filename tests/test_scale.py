@@ -219,13 +219,13 @@ def test_what_the_light_really_refuses_reaches_the_user(light, why, tmp_path, ca
 
 
 def test_a_given_light_wins_and_a_length_tells_its_map_where_the_light_tells_none(made, capsys):
-    argv = ["--length.ends", "[[0, 0, 0], [0, 3, 4]]", "--length.mm", "10", "--length.map", "1"]
+    argv = ["--length.ends", "[[0, 0, 5], [0, 3, 9]]", "--length.mm", "10", "--length.map", "1"]
     assert main(["scale", str(made), "--light", "gamma=2.2,mu=0", *argv]) == 0
     record = json.loads((made / "scale" / "scale.json").read_text())
     assert [one["mm_per_unit"] for one in record["maps"]] == [None, 2.0]
     assert record["maps"][1]["by"] == "a known length" and record["length"] == {
         "map": 1,
-        "ends": [[0.0, 0.0, 0.0], [0.0, 3.0, 4.0]],
+        "ends": [[0.0, 0.0, 5.0], [0.0, 3.0, 9.0]],
         "units": 5.0,
         "mm": 10.0,
         "error_mm": 1.0,
@@ -248,6 +248,21 @@ def test_a_given_light_wins_and_a_length_tells_its_map_where_the_light_tells_non
 def test_a_length_that_says_too_little_is_refused(given, why):
     with refused(found=why):
         given.known([0, 2], Path("run"))
+
+
+def test_a_length_far_from_the_surface_that_it_is_said_to_be_on_is_refused(made, capsys):
+    argv = ["scale", str(made), "--length.mm", "10", "--length.map", "1", "--length.ends"]
+    assert main([*argv, "[[0, 0, 9], [0, 0, 30]]"]) == 3 and not (made / "scale").exists()
+    said = capsys.readouterr().err
+    assert "--length.ends [0.0, 0.0, 30.0]: it is 20 from the surface of map 1" in said and "[0.0, 0.0, 10.0]" in said
+
+
+def test_a_length_whose_error_is_no_smaller_than_itself_is_refused_and_of_any_other_the_interval_is_finite():
+    given = LengthGiven(ends=[(0, 0, 0), (1, 0, 0)], mm=5.0, error_mm=5.0)
+    with refused(found="a standard error of 5 mm", cure="below the length"):
+        given.known([0], Path("run"))
+    known = replace(given, error_mm=4.9).known([0], Path("run"))
+    assert known is not None and np.isfinite(known.alone(figure(1.0)).interval).all()
 
 
 def test_what_is_no_run_in_map_units_is_refused(made, capsys):

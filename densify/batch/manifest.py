@@ -24,6 +24,7 @@ from typing import Any, get_type_hints
 from pydantic import TypeAdapter, ValidationError
 
 from densify.inputs import MapSource, SurfaceFiles
+from lightdepth.calibration import read_light
 from lightdepth.datasets import SequenceSource
 from lightdepth.datasets.extent import sequences_below
 from lightdepth.datasets.reading import is_sequence
@@ -31,11 +32,14 @@ from lightdepth.datasets.video_sequence import video_at
 from lightdepth.errors import InputError
 from lightdepth.files.below import is_result
 from lightdepth.files.reading import MOST_TEXT, check_bytes, reading
+from lightdepth.ranges import Range, ranges_of
 from lightdepth.regular import regular
 
 TABLES = (".csv", ".tsv")
 _MAGIC = re.compile(r"[*?\[]")
-_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}")
+_NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
+_LONGEST_NAME, _LONGEST_PART, _LONGEST_PATH = 100, 255, 4096
+"""Bytes: file systems take parts of 255, and a name gets digits and endings; Linux takes paths of 4096."""
 _PATHS = ("data", "map", "camera", "mask")
 _TYPES = (SequenceSource, MapSource)
 
@@ -79,15 +83,17 @@ def _may_be_one(path: Path, output: Path) -> bool:
     """Whether what a pattern matches may be a sequence: no result of a run, and no file but a video."""
     if path.is_file():
         return video_at(path) is not None
-    return not is_result(path) and path.resolve() != output
+    return not is_result(path) and os.path.realpath(path) != str(output)
 
 
 def _rows_of_table(table: Path) -> list[Row]:
     with reading(regular(table), "a table of sequences", "expected UTF-8 text, as a spreadsheet saves CSV"):
         check_bytes(table.stat().st_size, MOST_TEXT, table, "table")
         text = table.read_bytes().decode("utf-8-sig")
-        lines = list(csv.reader(io.StringIO(text, newline=""), delimiter=_delimiter(text), strict=True))
+        lines = _cells(table, text)
     columns = [word.strip().replace("-", "_") for word in lines[0]] if lines else []
+    while columns and not columns[-1]:  # spreadsheets save empty columns to the right
+        columns.pop()
     _check_columns(table, columns)
     rows: list[Row] = []
     names: dict[str, int] = {}
@@ -95,7 +101,7 @@ def _rows_of_table(table: Path) -> list[Row]:
         if not any(cell.strip() for cell in cells):
             continue
         where = f"{table}: row {number}"
-        if len(cells) > len(columns):
+        if any(cell.strip() for cell in cells[len(columns) :]):
             raise InputError(where, f"{len(cells)} cells", f"expected {len(columns)}, one of each column")
         row = _row(table, where, number, {c: cell.strip() for c, cell in zip(columns, cells, strict=False)})
         if row.name and (other := names.setdefault(row.name.lower(), number)) != number:
@@ -104,6 +110,16 @@ def _rows_of_table(table: Path) -> list[Row]:
     if not rows:
         raise InputError(table, "no row in it", "expected a line of column names, then a line of each sequence")
     return rows
+
+
+def _cells(table: Path, text: str) -> list[list[str]]:
+    lines = csv.reader(io.StringIO(text, newline=""), delimiter=_delimiter(text), strict=True)
+    try:
+        return list(lines)
+    except csv.Error as error:
+        found = f"cannot be parted into cells ({error})"
+        cure = "look for a quotation mark that is not closed, or that stands within a cell"
+        raise InputError(f"{table}: line {lines.line_num}", found, cure) from error
 
 
 def _delimiter(text: str) -> str:
@@ -130,26 +146,45 @@ def _row(table: Path, where: str, number: int, cells: Mapping[str, str]) -> Row:
     if "data" not in given:
         raise InputError(where, "no data", "expected the folder or the video of the sequence")
     name = cells.get("name", "")
-    if name and not _NAME.fullmatch(name):
-        raise InputError(where, f"name {name[:40]!r}", "expected letters, digits, dots, dashes and underscores")
+    if name and not (_NAME.fullmatch(name) and len(name.encode()) <= _LONGEST_NAME):
+        cure = f"expected letters, digits, dots, dashes and underscores, up to {_LONGEST_NAME} bytes"
+        raise InputError(where, f"name {name[:40]!r} of {len(name.encode())} bytes", cure)
     for option in _PATHS:
         if option in given and not (option == "camera" and given[option] == Path("auto")):
             given[option] = Path(os.path.normpath(table.parent / given[option]))
     light = given.get("light")
-    if light is not None and "=" not in light:
+    if light is not None and "=" in light:
+        try:
+            read_light(light)
+        except InputError as error:
+            raise error.within(where) from error
+    elif light is not None:
         given["light"] = os.path.normpath(table.parent / light)
     return Row(number, given.pop("data"), given, name)
 
 
 def _value(where: str, column: str, cell: str) -> Any:
-    """A cell as its option takes it. A number out of its range is refused where the options are put together."""
+    """A cell as its option takes it."""
     if "\0" in cell:
         raise InputError(where, f"{column}: a zero byte", "copy the table again")
+    longest = max(len(part.encode()) for part in cell.split(os.sep))
+    if len(cell.encode()) > _LONGEST_PATH or longest > _LONGEST_PART:
+        found = f"{column} {cell[:40]!r} of {len(cell.encode())} bytes, {longest} between two slashes"
+        raise InputError(where, found, f"expected up to {_LONGEST_PATH}, and {_LONGEST_PART} between two slashes")
     try:
-        return TypeAdapter(_kinds()[column]).validate_strings(cell)
+        value = TypeAdapter(_kinds()[column]).validate_strings(cell)
+        if wrong := _ranges()[column].wrong(value) if column in _ranges() else "":
+            raise InputError(where, f"{column} {cell[:40]!r}", wrong)
+        return value
     except ValidationError as error:
         said = error.errors()[0]["msg"]
         raise InputError(where, f"{column} {cell[:40]!r}", f"{said[0].lower()}{said[1:]}") from error
+
+
+@cache
+def _ranges() -> Mapping[str, Range]:
+    """The ranges of those that are numbers."""
+    return {name: one for settings in (*_TYPES, SurfaceFiles) for name, one in ranges_of(settings).items()}
 
 
 @cache

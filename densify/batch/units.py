@@ -19,9 +19,12 @@ from typing import Any
 from densify.batch.manifest import Row
 from densify.dense_run import Asked
 from densify.inputs import MapSource
+from lightdepth.calibration import read_camera, read_light
 from lightdepth.datasets import SequenceSource
 from lightdepth.datasets.extent import Extent, digits_of, extent_of
+from lightdepth.datasets.sequence import read_mask
 from lightdepth.errors import InputError
+from lightdepth.files.reading import reading
 from lightdepth.reporting.progress import counted_through
 from lightdepth.reporting.same import plain
 
@@ -67,8 +70,8 @@ def units_of(rows: Iterable[Row], asked: Asked) -> list[Unit]:
         if said in known:
             continue
         known.add(said)
-        extent, trouble = _extent(own.source)
-        called = f"row-{row.number:04d}" if extent is None else f"{row.name or 'seq'}-{_digits(extent, row.given)}"
+        extent, digits, trouble = _told_apart(own.source, row)
+        called = f"row-{row.number:04d}" if extent is None else f"{row.name or 'seq'}-{digits}"
         taken[called] += 1  # copies, and rows that digits of parts of them do not tell apart
         name = called if taken[called] == 1 else f"{called}-{taken[called]}"
         units.append(Unit(name, row, own, extent, trouble))
@@ -111,6 +114,17 @@ def check_files_of_all(source: SequenceSource, mapped: MapSource) -> None:
         raise InputError("--map", f"{mapped.map}, which would be the map of all", cure)
 
 
+def check_contents_of_all(source: SequenceSource, units: Iterable[Unit]) -> None:
+    """Raises InputError, before any work, where a file that serves for all sequences cannot be read."""
+    if source.light is not None:
+        read_light(source.light)
+    if source.mask is not None:
+        read_mask(source.mask)
+    extent = next((unit.extent for unit in units if unit.extent is not None), None)
+    if source.camera is not None and extent is not None and not source.asks_for_camera:
+        read_camera(source.camera, (extent.width, extent.height))
+
+
 def _asked_of(row: Row, asked: Asked) -> Asked:
     """What is asked of one row."""
     try:
@@ -132,11 +146,14 @@ def _over(settings: Any, given: Mapping[str, Any]) -> Mapping[str, Any]:
     return {each.name: given.get(each.name, getattr(settings, each.name)) for each in fields(settings)}
 
 
-def _extent(source: SequenceSource) -> tuple[Extent | None, str]:
+def _told_apart(source: SequenceSource, row: Row) -> tuple[Extent | None, str, str]:
+    """How much there is of a sequence and its digits, or why it cannot be read."""
     try:
-        return extent_of(source.data, source.format), ""
+        with reading(source.data, "a sequence", "expected a folder of frames, or a video such as .mp4 or .mov"):
+            extent = extent_of(source.data, source.format)
+            return extent, _digits(extent, row.given), ""
     except (InputError, OSError) as error:
-        return None, str(error)
+        return None, "", str(error)
 
 
 def _digits(extent: Extent, given: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ from shlex import quote
 from densify.batch.folder import PAGE, real_place
 from densify.batch.make import Maker
 from densify.batch.manifest import read_manifest
-from densify.batch.units import check_files_of_all, units_of
+from densify.batch.units import check_contents_of_all, check_files_of_all, units_of
 from densify.batch.work import Batch, Running, batch_run, check_running, told_failures
 from densify.config import DensifyConfig
 from densify.dense_run import Asked
@@ -80,6 +80,7 @@ def batch(
     predicting.load(details=False)  # what is wrong with it is better known before the night
     asked = Asked(source, mapped, predicting, config, sfm, files, fit_light, merge, merging)
     units = units_of(rows, asked)
+    check_contents_of_all(source, units)
     inside = None if mapped.map is None else f"in each: {mapped.map}"
     settings = recorded(source, predicting, config, files, sfm=sfm, fit_light=fit_light, merge=merge, merging=merging)
     arguments = {**settings, **vars(mapped), "map": inside, "data": None}

@@ -73,7 +73,8 @@ def live(
         sparse_map, frames = map_and_frames(run, source, mapped, sfm)
         run.hash_inputs(**source.files, map=mapped.map)
         doubts = doubts_of_inputs(run, sparse_map, frames)
-        run.begins(surfaces_of(sparse_map, frames), partial(surface_steps, sparse_map, frames, model, fit_light))
+        steps = partial(surface_steps, sparse_map, frames, model, fit_light, mapped.polish_map)
+        run.begins(surfaces_of(sparse_map, frames), steps)
         frames = fitted_light(run, frames, sparse_map, model, config, fit_light)
         result = PlayedRun(run, config.coverage, mm_per_unit, config.judge.on, doubts)
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:

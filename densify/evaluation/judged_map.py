@@ -37,6 +37,8 @@ def read_run(folder: Path) -> list[DenseMapFiles]:
     """The dense maps of a densify run, or of one of its map folders. Raises InputError when there are none."""
     maps = [read_dense_map(f) for f in map_folders(folder)]
     if not maps:
+        if not folder.exists():
+            raise InputError(folder, "does not exist", "expected the run folder of `lightdepth densify`")
         raise InputError(folder, "neither map_* folders nor .npz files in it", "expected a densify run, or predictions")
     return maps
 

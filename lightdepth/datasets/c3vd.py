@@ -156,7 +156,7 @@ def read_c3vd(
     )
 
 
-FORMAT = Format("c3vd", fits=is_c3vd, images=image_folder, has_camera=lambda _: True, read=read_c3vd)
+FORMAT = Format("c3vd", fits=is_c3vd, images=image_folder, has_camera=lambda _: True, read=read_c3vd, word="_color")
 
 
 def write_c3vd(frames: Sequence[Frame], path: Path, tree: str = "v1") -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,13 +75,16 @@ def digits_of(path: Path) -> str:
 
 def sequences_below(root: Path, without: Path) -> list[Path]:
     """The sequences in a folder of sequences, in order: folders of frames, folders with one video, and videos, no more
-    than three folders down. Results of runs are passed over, and so is `without`, where results are to come to."""
-    return list(_sequences(root, without.resolve(), _DEEP))
+    than three folders down. Results of runs are passed over, and so are `without`, where results are to come to, and
+    links to a folder that they are in."""
+    return list(_sequences(root, os.path.realpath(without), _DEEP))
 
 
-def _sequences(folder: Path, without: Path, deep: int) -> Iterator[Path]:
+def _sequences(folder: Path, without: str, deep: int) -> Iterator[Path]:
+    here = Path(os.path.realpath(folder))
     for path in sorted(folder.iterdir()):
-        if path.name.startswith(".") or hidden(path) or path.resolve() == without:
+        real = os.path.realpath(path)  # which, unlike resolve, takes links in a circle as they are
+        if path.name.startswith(".") or hidden(path) or real == without or here.is_relative_to(real):
             continue
         if path.is_file():
             if video_at(path) is not None:

@@ -62,6 +62,8 @@ class Format:
     read: Reader
     """The frames of a folder; camera, light and mask win over the files in it where they are given;
     `bit_depth` is that of pictures of more than 8 bits, found by looking where it is left out."""
+    word: str = ""
+    """What is in the names of the frames, where pictures of their truth lie among them."""
 
 
 @dataclass(frozen=True)

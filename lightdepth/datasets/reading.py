@@ -88,8 +88,10 @@ def frames_at(path: Path, format: str | None = None) -> list[Path]:
     if not path.is_dir() or (format in (None, "video") and video_at(path) is not None) or _is_cluster(path, format):
         return []
     data_set = _BY_NAME.get(format) if format is not None else _looks_like(path)
-    images = (data_set or folder.FORMAT).images(path)
-    return list_images(images) if images.is_dir() else []
+    chosen = data_set or folder.FORMAT
+    images = chosen.images(path)
+    files = list_images(images) if images.is_dir() else []
+    return [file for file in files if chosen.word in file.name] or files
 
 
 def image_files(path: Path, format: str | None = None) -> dict[int, str]:

@@ -94,6 +94,7 @@ FORMAT = Format(
     images=lambda path: path,
     has_camera=lambda path: camera_file(path) is not None,
     read=read_simcol,
+    word="FrameBuffer",
 )
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 from scipy.stats import t as student
 
+from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
 from lightdepth.frame import readable
@@ -178,19 +179,22 @@ def _whites(frames: FrameSequence, board: Board) -> tuple[list[White], int]:
         looked = [frame.image for frame in readable(frames, [rows[i] for i in (0, len(rows) // 2, -1)])]
         there = f"; {said}" if (said := what_is_there(looked, board)) else ""
     if seen < LEAST_FRAMES:
+        cure = (
+            "are --board.squares (squares, not the corners between them) and, of a charuco board, --board.dictionary "
+            "its own, and does it fill much of the image?"
+        )
         raise InputError(
             frames.source,
             f"{board.name} was found in {seen} of {len(rows)} frames{there}",
-            f"expected at least {LEAST_FRAMES}: are --board.squares (squares, not the corners between them) and, of a "
-            "charuco board, --board.dictionary its own, and does it fill much of the image?",
+            f"expected at least {LEAST_FRAMES}: {'take more, a dozen are good' if seen == len(rows) else cure}",
         )
     if astray > MOST_ASTRAY or len(found) < LEAST_FRAMES:
         raise InputError(
             frames.source,
             f"the board's corners lie {astray:.2%} of the image's width from their places (median over "
-            f"{seen} frames){there}",
-            f"expected at most {MOST_ASTRAY:.1%}: is the camera that of these frames, are the board's sizes its own, "
-            "and is it flat?",
+            f"{seen} frames), in {counted(len(found), 'frame')} no farther than {MOST_ASTRAY:.1%}{there}",
+            f"expected at most {MOST_ASTRAY:.1%}, in {LEAST_FRAMES} frames at least: is the camera that of these "
+            "frames, are the board's sizes its own, and is it flat?",
         )
     clipped = float(np.median([white.clipped for white in found]))
     usable = [white for white in found if len(white) >= LEAST_CELLS]

@@ -38,6 +38,9 @@ class KnownLength:
         if not (self.mm > 0 and self.error_mm > 0 and np.isfinite([self.mm, self.error_mm]).all()):
             found = f"{self.mm:g} mm, error {self.error_mm:g} mm"
             raise InputError("the known length", found, "expected numbers above 0")
+        if self.error_mm >= self.mm:
+            found = f"{self.mm:g} mm, with a standard error of {self.error_mm:g} mm"
+            raise InputError("the known length", found, "expected an error below the length, or it tells nothing")
 
     @property
     def mm_per_unit(self) -> float:

@@ -121,6 +121,14 @@ def millimetres(looks: Sequence[Look], light: PhotometricCalibration, near: floa
     return together([looks], light, [near], seed).maps[0]
 
 
+def unplaced(light: PhotometricCalibration) -> Millimetres | None:
+    """The refusal of a light of which nobody said where it sits: it tells no scale, whatever it shines on."""
+    if not light.assumed and np.hypot(*light.position_mm[:2]) > 0:
+        return None
+    why = "nobody gave the light" if light.assumed else "the light is said to sit in the camera"
+    return _untold(f"{why}: its position is needed")
+
+
 def together(
     maps: Sequence[Sequence[Look]],
     light: PhotometricCalibration,
@@ -132,10 +140,9 @@ def together(
     wall. Each scale is looked for from .4 to 2.5 times that in `near`, mm per map unit. `surface` is the deviation of
     its logarithm by what is wrong with the looks' distances; it is each map's own."""
     covariance = np.diag(np.full(len(maps), np.inf))
+    if (refusal := unplaced(light)) is not None:
+        return Together((refusal,) * len(maps), covariance)
     offset = float(np.hypot(*light.position_mm[:2]))
-    if light.assumed or offset == 0:
-        why = "nobody gave the light" if light.assumed else "the light is said to sit in the camera"
-        return Together(tuple(_untold(f"{why}: its position is needed") for _ in maps), covariance)
     rng = np.random.default_rng(seed)
     found = [_place(looks, light, rng) for looks in maps]
     rows = [i for i, one in enumerate(found) if isinstance(one, _Placed)]

@@ -71,7 +71,7 @@ class Run:
         arguments: Mapping[str, Any],
         parts: Mapping[str, Part] | None = None,
     ) -> None:
-        self.folder, self.output = folder, output
+        self._folder, self.output = folder, output
         self.record: dict[str, Any] = {"failures": [], "warnings": []}
         self.parts = None if parts is None else dict(parts)
         self.resumed = bool(parts)
@@ -85,6 +85,12 @@ class Run:
         self._named = Names()
         self.unlisted: Mapping[str, Any] = {}  # inputs that do not stand among the arguments
         self.plan: Plan | None = None  # of a dry run, which writes nothing
+
+    @property
+    def folder(self) -> Path:
+        """Where to write, which a dry run has not."""
+        assert self.plan is None, "a dry run writes nothing"
+        return self._folder
 
     @property
     def resumable(self) -> bool:
@@ -217,11 +223,10 @@ class Run:
         """What the inputs are called in the run's files; no names where paths are kept."""
         if self.keep_names:
             return Names()
-        hashed = {
-            known["path"]: known["sha256"] for known in (self.record.get("inputs") or {}).values() if "path" in known
-        }
+        inputs = (self.record.get("inputs") or {}).values()
+        hashed = {known["path"]: known["sha256"] for known in inputs if "path" in known}
         argv = () if "command" in self.record else sys.argv
-        return names_of(self._given, (self.output, self.folder), self.unlisted, argv, hashed)
+        return names_of(self._given, (self.output, self._folder), self.unlisted, argv, hashed)
 
     def settle(self) -> None:
         """All files but run.json are as they stay, and on the disk."""
@@ -292,12 +297,9 @@ def run_folder(
             raise
         cure = f"give a folder in it: -o {output / 'run'}" if real.is_dir() else "choose another -o"
         raise InputError(output, f"cannot be made ({error.strerror})", cure) from error
-    if run.record["failures"]:
-        first = run.record["failures"][0]
-        raise PartialFailure(
-            f"{counted(len(run.record['failures']), 'part')} failed, the first: {first['what']}: {first['reason']}. "
-            f"The rest is in {output}"
-        )
+    if failures := run.record["failures"]:
+        first = f"the first: {failures[0]['what']}: {failures[0]['reason']}"
+        raise PartialFailure(f"{counted(len(failures), 'part')} failed, {first}. The rest is in {output}")
 
 
 @contextmanager
