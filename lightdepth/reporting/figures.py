@@ -32,6 +32,16 @@ def jpeg(image: np.ndarray, quality: int = 88) -> bytes:
     return data.tobytes()
 
 
+def webp(image: np.ndarray, quality: int = 88) -> bytes:
+    """WebP of an RGB image (H, W, 3), or of one that is clear in places (H, W, 4), uint8 or float in [0, 1]: as small
+    as a JPEG, and the page shows where it is clear."""
+    image = _eight_bits(image)
+    image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[-1] == 3 else cv2.COLOR_RGBA2BGRA)
+    done, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    assert done
+    return data.tobytes()
+
+
 def _eight_bits(image: np.ndarray) -> np.ndarray:
     if image.dtype == np.uint8:
         return image
@@ -70,6 +80,15 @@ def level_colors(shares: np.ndarray) -> np.ndarray:
     """Colours (n, 3) in [0, 1] of shares (n,) in [0, 1]: violet low, yellow high."""
     found: np.ndarray = _viridis(np.rint(255 * np.clip(shares, 0, 1))[:, None])[:, 0] / 255
     return found
+
+
+def signed_colors(level: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Errors (H, W), of which -1 and 1 have the full colour, as colours (H, W, 3) uint8: white right, red above 0, blue
+    below, grey where nothing is known."""
+    level = np.clip(level, -1, 1)[..., None]
+    red, blue = np.array([200, 20, 20]), np.array([20, 60, 200])
+    colors = np.where(level > 0, 255 + level * (red - 255.0), 255 - level * (blue - 255.0))
+    return np.where(known[..., None], colors, 120).astype(np.uint8)
 
 
 def marked_points(
@@ -199,6 +218,10 @@ class MeshView:
         color = PLAIN if colors is None else np.einsum("kci,kc->ki", colors[self.corners], self.weights)
         picture[self.met] = np.rint(255 * np.clip(color * self.shade[:, None], 0, 1))
         return picture
+
+    def cutout(self, colors: np.ndarray | None = None) -> np.ndarray:
+        """The same (H, W, 4), clear where there is no surface: for pages, which are light or dark."""
+        return np.dstack([self.picture(colors), 255 * self.met.astype(np.uint8)])
 
 
 def _outside(vertices: np.ndarray, u: np.ndarray, v: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
