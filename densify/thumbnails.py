@@ -14,21 +14,19 @@ from densify.predictions import SeenKeyframe
 from densify.scene import KEYFRAMES
 from lightdepth.datasets import FrameSequence
 from lightdepth.errors import InputError
-from lightdepth.prediction import DepthPrediction
 from lightdepth.reporting.figures import (
+    UNSURE,
     colored_distance,
     jpeg,
-    level_colors,
     marked_points,
     side_by_side,
     signed_colors,
     thumbnail,
+    uncertainty_colors,
 )
 from lightdepth.reporting.scene import Picture
 from lightdepth.sparse_map import SparseMap
 
-UNSURE = 0.3
-"""Predicted standard deviation of log distance from which on a pixel is yellow."""
 OFF = 0.25
 """Share of its distance by which a map point is off the depth where its dot has its full colour."""
 PICTURES = 24
@@ -50,8 +48,10 @@ class Thumbnails:
         name, number = aligned.keyframe.name, aligned.keyframe.number
         if number in self.rows or seen.frame is None or seen.prediction is None:
             return
-        distance = colored_distance(seen.prediction.distance, seen.prediction.valid)
-        unsure, residual = uncertainty_colors(seen.prediction), residual_picture(aligned, seen.frame.image)
+        valid, sigma = seen.prediction.valid, seen.prediction.uncertainty
+        distance = colored_distance(seen.prediction.distance, valid)
+        unsure = None if sigma is None else uncertainty_colors(sigma, valid)
+        residual = residual_picture(aligned, seen.frame.image)
         shown = [None if p is None else thumbnail(p, _WIDTH) for p in (distance, unsure, residual)]
         empty = np.zeros_like(thumbnail(distance, _WIDTH))
         self.rows[number] = jpeg(side_by_side([empty if p is None else p for p in shown]), 80)
@@ -82,17 +82,6 @@ def images_alone(frames: FrameSequence, sparse_map: SparseMap) -> dict[str, Pict
         with suppress(InputError):
             found[name] = Picture(jpeg(thumbnail(frames.of_keyframe(keyframes[name]).image, _WIDTH), 80))
     return found
-
-
-def uncertainty_colors(prediction: DepthPrediction) -> np.ndarray | None:
-    """Predicted uncertainty as colours (H, W, 3) uint8: violet sure, yellow unsure, black where nothing is known. None
-    where none is predicted."""
-    if prediction.uncertainty is None:
-        return None
-    known = prediction.valid & np.isfinite(prediction.uncertainty)
-    level = np.where(known, prediction.uncertainty, 0) / UNSURE
-    colors = np.rint(255 * level_colors(level.ravel())).reshape(*level.shape, 3)
-    return np.where(known[..., None], colors, 0).astype(np.uint8)
 
 
 def residual_picture(aligned: AlignedKeyframe, image: np.ndarray) -> np.ndarray | None:

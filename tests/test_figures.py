@@ -10,16 +10,19 @@ import trimesh
 from lightdepth.reporting.figures import (
     BAD,
     GOOD,
+    UNSURE,
     MeshView,
     chart,
     chart_png,
     colored_distance,
     contact_sheet,
     marked_points,
+    normal_colors,
     png,
     side_by_side,
     signed_colors,
     thumbnail,
+    uncertainty_colors,
     webp,
 )
 
@@ -131,6 +134,22 @@ def test_a_cutout_is_clear_where_there_is_no_surface_and_a_webp_keeps_that():
 def test_errors_are_white_where_right_red_above_blue_below_and_grey_where_unknown():
     colors = signed_colors(np.array([[0.0, 1.0, -5.0, 0.0]]), np.array([[True, True, True, False]]))[0].tolist()
     assert colors == [[255, 255, 255], [200, 20, 20], [20, 60, 200], [120, 120, 120]]
+
+
+def test_the_uncertainty_is_yellow_where_it_is_large_violet_where_small_and_black_where_nothing_is_known():
+    doubt, valid = np.zeros((20, 30), np.float32), np.ones((20, 30), bool)
+    doubt[:, 15:], doubt[1, 1], valid[0] = UNSURE, np.nan, False
+    colors = uncertainty_colors(doubt, valid).astype(int)
+    violet, yellow = colors[10, 5], colors[10, 20]
+    assert violet[2] > violet[1] and yellow[0] > 200 and yellow[1] > 200 and yellow[2] < 80
+    assert not colors[0].any() and not colors[1, 1].any()
+
+
+def test_normals_are_blue_towards_the_camera_red_to_the_right_and_green_up():
+    normals = np.array([[[0, 0, -1.0], [1, 0, 0], [0, -1, 0], [0, 0, -1]]])
+    colors = normal_colors(normals, np.array([[True, True, True, False]]))[0].astype(int)
+    assert [color.argmax() for color in colors[:3]] == [2, 0, 1] and not colors[3].any()
+    assert colors[0, 2] == 255 and abs(colors[0, 0] - 128) <= 1
 
 
 def test_a_chart_needs_no_display(monkeypatch):

@@ -19,7 +19,7 @@ from densify.page import Gallery
 from densify.pipeline import densify
 from densify.predictions import SeenKeyframe
 from densify.scene import KINDS, surface_of_files
-from densify.thumbnails import OFF, UNSURE, Thumbnails, residual_picture, residuals, uncertainty_colors
+from densify.thumbnails import OFF, Thumbnails, residual_picture, residuals
 from densify.viewing.pictures import Pictures
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
@@ -71,17 +71,6 @@ def test_a_keyframe_without_a_scale_or_a_point_has_no_residual(scale):
     assert residual_picture(aligned([1.0] * 3, [1.0] * 3, scale, "no"), IMAGE) is None
     keyframe = replace(aligned([1.0] * 3, [1.0] * 3, 1.0), observed=None)
     assert residual_picture(keyframe, IMAGE) is None
-
-
-def test_the_uncertainty_is_yellow_where_it_is_large_violet_where_small_and_black_where_nothing_is_known():
-    doubt = np.full((CAMERA.height, CAMERA.width), 0.0, np.float32)
-    doubt[:, 32:] = UNSURE
-    doubt[1, 1] = np.nan
-    colors = uncertainty_colors(predicted(doubt)).astype(int)
-    violet, yellow = colors[20, 5], colors[20, 50]
-    assert violet[2] > violet[1] and yellow[0] > 200 and yellow[1] > 200 and yellow[2] < 80
-    assert not colors[0].any() and not colors[1, 1].any()
-    assert uncertainty_colors(predicted(None)) is None
 
 
 def test_every_keyframe_has_a_row_in_the_run_and_some_have_their_pictures_in_the_report(tmp_path):

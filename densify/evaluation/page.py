@@ -73,6 +73,7 @@ def evaluation_page(
         if pictures or scene is not None:
             report.heading(f"Where it errs{f', {name}' if len(found) > 1 else ''}")
         if scene is not None:
+            report.text("Each surface, in the true world, is coloured by its distance to the true surface.")
             report.scene(scene)
         report.wide_figures(pictures)
     _show(report, [table for table in tables_of(found, withheld, suite) if table not in short])

@@ -13,6 +13,8 @@ import numpy as np
 from lightdepth import native
 
 GOOD, BAD, KEPT = (0, 200, 80), (235, 40, 40), (255, 170, 0)
+UNSURE = 0.3
+"""Predicted standard deviation of log distance from which on a pixel is yellow."""
 PLAIN = (0.82, 0.8, 0.78)
 """of a surface that is shown without its colour"""
 
@@ -89,6 +91,23 @@ def signed_colors(level: np.ndarray, known: np.ndarray) -> np.ndarray:
     red, blue = np.array([200, 20, 20]), np.array([20, 60, 200])
     colors = np.where(level > 0, 255 + level * (red - 255.0), 255 - level * (blue - 255.0))
     return np.where(known[..., None], colors, 120).astype(np.uint8)
+
+
+def uncertainty_colors(sigma: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Standard deviations of log distance (H, W) as colours (H, W, 3) uint8: violet sure, yellow unsure, black where
+    nothing is known."""
+    known = valid & np.isfinite(sigma)
+    level = np.where(known, sigma, 0) / UNSURE
+    colors = np.rint(255 * level_colors(level.ravel())).reshape(*level.shape, 3)
+    return np.where(known[..., None], colors, 0).astype(np.uint8)
+
+
+def normal_colors(normals: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Unit normals (H, W, 3) in camera axes as colours uint8: red to the right, green up, blue towards the camera;
+    black where there is none."""
+    known = valid & np.isfinite(normals).all(-1)
+    colors = 127.5 * (1 + np.where(known[..., None], normals, 0) * [1, -1, -1])
+    return np.where(known[..., None], np.rint(colors), 0).astype(np.uint8)
 
 
 def marked_points(
