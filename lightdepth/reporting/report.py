@@ -23,8 +23,8 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-
 """What a browser is told to refuse: all that does not stand in the page."""
 
 _VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
-_KINDS = {b"\xff\xd8": "jpeg", b"RIFF": "webp", b"\x89PNG": "png"}
-"""Pictures by how they begin."""
+_KINDS = {b"\xff\xd8": "jpeg", b"RIFF": "webp"}
+"""Pictures by how they begin; others are PNG."""
 _SHORT = 14
 """Characters of a cell that stay in one line."""
 SMALL = 110
@@ -156,7 +156,7 @@ def _figure(data: bytes, caption: str) -> str:
 
 
 def _image(data: bytes, words: str) -> str:
-    kind = next(kind for begin, kind in _KINDS.items() if data.startswith(begin))
+    kind = next((kind for begin, kind in _KINDS.items() if data.startswith(begin)), "png")
     drawn = ' class="chart"' if isinstance(data, Chart) else ""
     return f'<img{drawn} alt="{_shown(words)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
 
