@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS = 1
 # Some hundred processes import the same modules: compiled once, for all of them.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-slow fuzz mutants kill soak offline coverage docs lint format bench same ablation ablation-paper clean
+.PHONY: setup demo test test-slow fuzz mutants kill soak offline coverage docs dist lint format bench same ablation ablation-paper clean
 
 setup: $(VENV)/.ready
 
@@ -67,6 +67,10 @@ offline: setup
 docs: setup
 	$(BIN)/mkdocs build --strict --quiet
 
+# What is handed on, in dist/: an sdist with the site in it, to be read without a network, and a wheel from that.
+dist: docs
+	$(BIN)/python -m build
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -93,4 +97,4 @@ ablation-paper: setup
 	$(BIN)/lightdepth ablate --config configs/ablation/paper.yaml -o runs/ablation-paper --table docs/ablation-paper.md
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist site *.egg-info

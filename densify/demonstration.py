@@ -16,7 +16,7 @@ from densify.judging.verdict import COLOURS, Verdict
 from lightdepth.sparse_map import SparseMap
 from lightdepth.tube.map_errors import MapErrors, moved_ids, with_errors
 
-SIDE = 0.4
+SIDE = 0.5
 """Share of the submap's points that are too far away."""
 
 

@@ -172,10 +172,17 @@ class DenseMap(Brief):
             np.add.at(votes[side], self.submap.rows_of(ids)[0], 1)
         return votes.sum(0) > 0, votes[0] > votes[1]
 
-    def write(self, folder: str | Path, formats: tuple[str, ...] = ("ply",), mm_per_unit: float | None = None) -> None:
+    def write(
+        self,
+        folder: str | Path,
+        formats: tuple[str, ...] = ("ply",),
+        mm_per_unit: float | None = None,
+        seen: np.ndarray | None = None,
+    ) -> None:
         """mesh.*, cloud.ply, sparse.ply, keyframes.csv, trajectory.tum, camera.json; trajectory times are frame
-        numbers. With mm_per_unit, lengths are written in mm. Of a map that lies far from its origin, origin.json has
-        what all coordinates lack. `folder` is made; raises InputError where it is there."""
+        numbers. With mm_per_unit, lengths are written in mm. `seen` (n,) is how well each vertex was seen
+        (densify.scene.seen_kinds). Of a map that lies far from its origin, origin.json has what all coordinates lack.
+        `folder` is made; raises InputError where it is there."""
         import trimesh
 
         folder = Path(folder)
@@ -190,6 +197,8 @@ class DenseMap(Brief):
             if suffix == "ply" and self.confidence is not None and self.views is not None and len(self.vertices):
                 mesh.vertex_attributes["confidence"] = self.confidence.astype(np.float32)
                 mesh.vertex_attributes["views"] = self.views.astype(np.int32)
+                if seen is not None:
+                    mesh.vertex_attributes["seen"] = seen.astype(np.int32)
                 if self.expected_error is not None and self.aligned:
                     mesh.vertex_attributes["expected_error"] = (self.expected_error * scale).astype(np.float32)
             mesh.export(folder / f"mesh.{suffix}")
@@ -258,7 +267,8 @@ def write_cloud(path: Path, points: np.ndarray, colors: np.ndarray, normals: np.
 class DenseMapFiles(Brief):
     """A dense map read back from its folder: the surface, the sparse points, which of them were used and which were
     found wrong, the keyframes' frame numbers and poses map_from_cam (n, 4, 4), and the map's camera; confidence, views,
-    expected error and colour (n, 3) uint8 of each vertex, where the file has them."""
+    expected error, colour (n, 3) uint8 and how well it was seen (densify.scene.seen_kinds) of each vertex, where the
+    file has them."""
 
     id: int
     vertices: np.ndarray
@@ -273,6 +283,7 @@ class DenseMapFiles(Brief):
     expected_error: np.ndarray | None = None
     colors: np.ndarray | None = None
     sparse_wrong: np.ndarray | None = None
+    seen: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -353,7 +364,7 @@ def _dense_map(folder: Path, map_id: int) -> DenseMapFiles:
         found = "a vertex is at no place, or a triangle has one that is not there"
         raise InputError(folder / "mesh.ply", found, "copy it again from the run")
     numbers, poses = read_tum(folder / "trajectory.tum")
-    own = vertex_columns(mesh, ("confidence", "views", "expected_error")) if len(triangles) else {}
+    own = vertex_columns(mesh, ("confidence", "views", "expected_error", "seen")) if len(triangles) else {}
     return DenseMapFiles(
         id=map_id,
         vertices=vertices,

@@ -6,10 +6,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 
 from densify.additions import additions, said
 from densify.aligned import AlignedKeyframe
 from densify.config import DensifyConfig
+from densify.dense_map import DenseMap
 from densify.gating import LEFT_OUT
 from densify.joining import MergeConfig, Merged, joined_name, merge
 from densify.judging.doubts import DoubtsCalibrated, calibrated_together
@@ -20,6 +22,7 @@ from densify.predictions import SeenKeyframe
 from densify.resuming import kept_result
 from densify.scale_file import MmPerUnit, Scales, factor
 from densify.scaling import SeenMap, scales_of
+from densify.scene import seen_kinds
 from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence
 from lightdepth.depth_gate import sentence
@@ -213,7 +216,7 @@ class Densified:
             if not len(dense.triangles):
                 run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
                 continue
-            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, scale)
+            _write_map(dense, run.folder / name, formats, mm_per_unit, scale)
             text = f"{name}: {len(dense.aligned)} of {len(dense.alignments)} keyframes aligned, "
             text += f"{len(dense.vertices)} vertices"
             if judgement is not None:
@@ -228,6 +231,7 @@ class Densified:
             run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
         if self.merged is not None:
             self._write_joined(run, self.merged, formats, mm_per_unit)
+        self.gallery.thumbnails.write(run.folder)
         if self.doubted:
             run.log(self.doubted)
         self._say_if_few(run)
@@ -265,12 +269,16 @@ class Densified:
                 run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
                 continue
             scale = factor(mm_per_unit, next(iter(group)))
-            replace(dense, unit="mm" if mm_per_unit else dense.unit).write(run.folder / name, formats, scale)
+            _write_map(dense, run.folder / name, formats, mm_per_unit, scale)
             maps = ", ".join(map(str, sorted(group)))
             text = f"{name}: maps {maps} in one, in the unit of map {next(iter(group))}, "
             run.log(f"{text}{len(dense.aligned)} of {len(dense.alignments)} keyframes aligned")
         for map_id, reason in merged.meeting.alone().items():
             run.log(f"map {map_id} joins no other: {reason}")
+
+
+def _write_map(dense: DenseMap, folder: Path, formats: tuple[str, ...], unit: MmPerUnit, scale: float) -> None:
+    replace(dense, unit="mm" if unit else dense.unit).write(folder, formats, scale, seen_kinds(dense))
 
 
 def unsure(share: float, config: DensifyConfig) -> str:

@@ -15,7 +15,8 @@ from densify.judging.verdict import spoke
 from densify.pipeline import SubmapResult
 from densify.predictions import SeenKeyframe
 from densify.scale_file import MmPerUnit, factor
-from densify.scene import KINDS, SURFACE_FILES, TRUSTED, Thumbnails, scene_of, seen_kinds, surface_of, tangents
+from densify.scene import KINDS, SURFACE_FILES, TRUSTED, seen_kinds, surface_of, tangents
+from densify.thumbnails import Thumbnails, said
 from lightdepth.camera import CameraModel
 from lightdepth.reporting.figures import (
     BAD,
@@ -26,11 +27,11 @@ from lightdepth.reporting.figures import (
     colored_distance,
     jpeg,
     marked_points,
-    side_by_side,
     thumbnail,
+    webp,
 )
-from lightdepth.reporting.report import Report, number
-from lightdepth.reporting.scene import Surface
+from lightdepth.reporting.report import Report, Tile, number
+from lightdepth.reporting.scene import Scene, Surface
 from lightdepth.sparse_map import SparseMap, Submap
 
 
@@ -43,11 +44,11 @@ class Gallery:
             for s in sparse_map.submaps
             for i in np.linspace(0, len(s.keyframes) - 1, per_map + 2).astype(int)[1:-1]
         }
-        self.pictures: dict[int, list[tuple[bytes, str]]] = {s.id: [] for s in sparse_map.submaps}
+        self.pictures: dict[int, list[tuple[list[Tile], str]]] = {s.id: [] for s in sparse_map.submaps}
         self.thumbnails = Thumbnails(sparse_map)
 
     def __call__(self, submap: Submap, aligned: AlignedKeyframe, seen: SeenKeyframe) -> None:
-        self.thumbnails(aligned.keyframe.name, seen)
+        self.thumbnails(aligned, seen)
         if (submap.id, aligned.keyframe.number) not in self._chosen or seen.frame is None or seen.prediction is None:
             return
         assert aligned.observed is not None
@@ -61,12 +62,14 @@ class Gallery:
         depth = thumbnail(colored_distance(seen.prediction.distance[part], seen.prediction.valid[part]), 480)
         pixels = aligned.observed.pixels - corner
         points = marked_points(image, [(pixels[bad], BAD), (pixels[good], GOOD)])
-        picture = side_by_side([thumbnail(image, 480), depth, points])
+        shown = {
+            "image": thumbnail(image, 480),
+            "predicted distance, yellow near": depth,
+            "map points, green in, red out": points,
+        }
         state = f"scale {number(a.scale)}, {len(a.inlier_ids)} of {a.points} points inliers" if a.ok else a.reason
-        caption = (
-            f"{aligned.keyframe.name}: image, predicted distance (yellow near), map points (green in, red out); {state}"
-        )
-        self.pictures[submap.id].append((jpeg(picture), caption))
+        tiles = [Tile(jpeg(picture), label) for label, picture in shown.items()]
+        self.pictures[submap.id].append((tiles, f"{aligned.keyframe.name}: {state}"))
 
 
 def densify_page(
@@ -84,7 +87,7 @@ def densify_page(
     page = Report(title)
     for note in notes:
         page.text(note)
-    scene = scene_of(_surfaces(results, merged, errors), gallery.thumbnails.found)
+    scene = Scene.of(_surfaces(results, merged, errors), gallery.thumbnails.found, said())
     if scene is not None:
         page.heading("The surface in three dimensions")
         page.scene(scene)
@@ -285,7 +288,8 @@ def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:
             )
         ]
     )
-    page.wide_figures(gallery.pictures[dense.submap.id])
+    for tiles, caption in gallery.pictures[dense.submap.id]:
+        page.tiles(tiles, caption)
 
 
 def mesh_pictures(dense: DenseMap, name: str = "") -> list[list[tuple[bytes, str]]]:
@@ -297,12 +301,12 @@ def mesh_pictures(dense: DenseMap, name: str = "") -> list[list[tuple[bytes, str
     inside = MeshView.of(*mesh, origin=middle.center, axes=axes, focal=focal)
     views = {
         f"Surface of {name} from outside": MeshView.of(*mesh),
-        f"From keyframe {middle.name}; white is no surface": inside,
+        f"From keyframe {middle.name}; empty where there is no surface": inside,
     }
     ways: list[tuple[np.ndarray | None, str]] = [(dense.colors, ""), (None, "Its shape, without its colour")]
     if (kinds := seen_kinds(dense)) is not None:
         ways.append((KINDS[kinds], f"Seen well (green), weakly (orange), or of a confidence below {TRUSTED} (red)"))
-    return [[(jpeg(view.picture(c)), text or said) for c, text in ways] for said, view in views.items()]
+    return [[(webp(view.cutout(c)), text or said) for c, text in ways] for said, view in views.items()]
 
 
 def _focal_to_see(camera: CameraModel) -> float:
@@ -321,6 +325,7 @@ def _scale_chart(dense: DenseMap) -> bytes:
     spread = np.array([a.sigma / max(a.range_90, 1e-12) for a in dense.alignments]) * scale
     axes.errorbar(numbers[ok], scale[ok], yerr=spread[ok], fmt="o-", markersize=4, capsize=2, color="#2a6f97")
     axes.set_xlabel("frame")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylabel("map units per predicted unit")
     axes.set_ylim(bottom=0)
     return chart_png(figure)

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 
 import numpy as np
 
 from densify.coverage import seen_well
 from densify.dense_map import GREEN, GREY, RED, DenseMap, DenseMapFiles, KeyframeRow
-from densify.evaluation.pictures import FARTHEST_COLOR_MM, error_colors
-from densify.predictions import SeenKeyframe
+from densify.evaluation.pictures import error_layer
 from lightdepth.camera import CameraModel
-from lightdepth.reporting.figures import PLAIN, MeshView, colored_distance, jpeg, level_colors, outside_axes, thumbnail
-from lightdepth.reporting.scene import Cloud, Layer, Picture, Pose, Scene, Surface
-from lightdepth.sparse_map import SparseMap
+from lightdepth.reporting.figures import (
+    PLAIN,
+    level_colors,
+    outside_axes,
+)
+from lightdepth.reporting.scene import Cloud, Layer, Pose, Scene, Surface, bytes_of
 
 SEEN_WELL, SEEN_WEAKLY, DOUBTFUL = (0.45, 0.75, 0.55), (0.95, 0.6, 0.15), (0.8, 0.15, 0.15)
 TRUSTED = 0.2
@@ -32,39 +33,10 @@ SURFACE_FILES = {
 }
 """What the files of a surface are, by pattern."""
 
-PICTURES = 24
-"""The most keyframes whose pictures a scene has."""
-_WIDTH = 240  # of such a picture
+KEYFRAMES = "keyframes"
+"""The folder in a run with a row of small pictures for each keyframe."""
 TRIANGLES = Scene.most
 """The most triangles that are shown of a surface."""
-_TOGETHER = 250_000  # triangles of all surfaces
-_FEWEST = 4_000  # of each, however many there are
-
-
-class Thumbnails:
-    """Pictures of some keyframes, spread over all submaps, taken as they pass; `found` has them by keyframe."""
-
-    def __init__(self, sparse_map: SparseMap, most: int = PICTURES):
-        names = list(dict.fromkeys(k.name for s in sparse_map.submaps for k in s.keyframes))
-        rows = np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int)
-        self._chosen = {names[i] for i in rows}
-        self.found: dict[str, Picture] = {}
-
-    def __call__(self, name: str, seen: SeenKeyframe) -> None:
-        if name not in self._chosen or name in self.found or seen.frame is None or seen.prediction is None:
-            return
-        depth = colored_distance(seen.prediction.distance, seen.prediction.valid)
-        self.found[name] = Picture(*(jpeg(thumbnail(each, _WIDTH), 80) for each in (seen.frame.image, depth)))
-
-
-def scene_of(surfaces: Sequence[Surface], pictures: Mapping[str, Picture] = MappingProxyType({})) -> Scene | None:
-    """The surfaces that have a triangle, the first of them in a still picture too; None where there is none. Many are
-    shown with fewer triangles each."""
-    shown = tuple(surface for surface in surfaces if len(surface.triangles))
-    if not shown:
-        return None
-    still = MeshView.of(shown[0].vertices, shown[0].triangles).picture(shown[0].layers[0].colors())
-    return Scene(shown, jpeg(still), pictures, max(min(TRIANGLES, _TOGETHER // len(shown)), _FEWEST))
 
 
 def surface_of(title: str, dense: DenseMap, distance: np.ndarray | None = None) -> Surface:
@@ -79,9 +51,7 @@ def surface_of(title: str, dense: DenseMap, distance: np.ndarray | None = None) 
     )
     keyframes = dense.submap.keyframes
     layers = [*_looks(dense.colors), *_confidence(dense.confidence)]
-    if (kinds := seen_kinds(dense)) is not None:
-        marks = ((0.0, "seen well"), (0.5, "seen weakly"), (1.0, f"confidence below {TRUSTED}"))
-        layers.append(Layer("How well seen", kinds, _bytes(KINDS), marks))
+    layers += _seen(seen_kinds(dense))
     return Surface(
         title,
         dense.vertices,
@@ -97,21 +67,21 @@ def surface_of(title: str, dense: DenseMap, distance: np.ndarray | None = None) 
 def surface_of_files(
     title: str, read: DenseMapFiles, keyframes: Sequence[KeyframeRow], distance: np.ndarray | None = None
 ) -> Surface:
-    """As `surface_of`, for what was read back from a map folder: in the place of how well it was seen, which also hangs
-    on weights that no file has, by how many keyframes."""
+    """As `surface_of`, for what was read back from a map folder; also by how many keyframes saw it."""
     wrong = np.zeros(len(read.sparse), bool) if read.sparse_wrong is None else read.sparse_wrong
     clouds = (
         Cloud("Points used", read.sparse[read.sparse_inlier], GREEN),
         Cloud("Points found wrong", read.sparse[wrong], RED),
         Cloud("Points not judged", read.sparse[~(read.sparse_inlier | wrong)], GREY),
     )
-    colors = np.broadcast_to(_bytes(np.array([PLAIN])), (len(read.vertices), 3))
+    colors = np.broadcast_to(bytes_of(np.array([PLAIN])), (len(read.vertices), 3))
     layers = [*_looks((colors if read.colors is None else read.colors) / 255), *_confidence(read.confidence)]
+    layers += _seen(read.seen)
     if read.views is not None:
         marks = ((0.0, "seen by 1 keyframe"), (0.5, f"{(MANY + 1) // 2}"), (1.0, f"{MANY} and more"))
         steps = np.clip((read.views - 1) / (MANY - 1), 0, 1)
         layers.append(
-            Layer("Keyframes that saw it", _bytes(steps), _bytes(level_colors(np.linspace(0, 1, 256))), marks)
+            Layer("Keyframes that saw it", bytes_of(steps), bytes_of(level_colors(np.linspace(0, 1, 256))), marks)
         )
     poses = zip(keyframes, read.map_from_cam, strict=True)
     return Surface(
@@ -129,8 +99,8 @@ def surface_of_files(
 def _looks(colors: np.ndarray) -> list[Layer]:
     """The colours of the images (n, 3) in [0, 1], and the shape without them."""
     return [
-        Layer("Of the images", _bytes(colors)),
-        Layer("Shape alone", None, _bytes(np.array([PLAIN]))),
+        Layer("Of the images", bytes_of(colors)),
+        Layer("Shape alone", None, bytes_of(np.array([PLAIN]))),
     ]
 
 
@@ -139,21 +109,20 @@ def _confidence(confidence: np.ndarray | None) -> list[Layer]:
     if confidence is None:
         return []
     marks = ((0.0, "confidence 0"), (0.5, "0.5"), (1.0, "1"))
-    return [Layer("Confidence", _bytes(confidence), _bytes(level_colors(np.linspace(0, 1, 256))), marks)]
+    return [Layer("Confidence", bytes_of(confidence), bytes_of(level_colors(np.linspace(0, 1, 256))), marks)]
+
+
+def _seen(kinds: np.ndarray | None) -> list[Layer]:
+    """Where it is known; of a file of a stranger's, numbers that are none of the kinds are not."""
+    if kinds is None or not np.isin(kinds, range(len(KINDS))).all():
+        return []
+    marks = ((0.0, "seen well"), (0.5, "seen weakly"), (1.0, f"confidence below {TRUSTED}"))
+    return [Layer("How well seen", kinds.astype(np.uint8), bytes_of(KINDS), marks)]
 
 
 def _error(distance: np.ndarray | None, count: int) -> list[Layer]:
     """Distance (n,) [mm] from the truth, where it is that of the vertices, of which there are `count`."""
-    if distance is None or len(distance) != count:
-        return []
-    far = FARTHEST_COLOR_MM
-    marks = ((0.0, "off by 0 mm"), (0.5, f"{far / 2:g} mm"), (1.0, f"{far:g} mm and more"))
-    return [Layer("Error", _bytes(distance / far), _bytes(error_colors(far * np.linspace(0, 1, 256))), marks)]
-
-
-def _bytes(shares: np.ndarray) -> np.ndarray:
-    found: np.ndarray = np.rint(255 * np.clip(shares, 0, 1)).astype(np.uint8)
-    return found
+    return [] if distance is None or len(distance) != count else [error_layer(distance)]
 
 
 KINDS = np.array([SEEN_WELL, SEEN_WEAKLY, DOUBTFUL])

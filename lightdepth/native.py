@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from functools import cache
 from importlib.util import find_spec
 from types import ModuleType
@@ -42,6 +43,8 @@ def open3d() -> ModuleType:
             ctypes.CDLL(str(path), ctypes.RTLD_GLOBAL)
     except (ImportError, OSError):
         pass  # a system libusb may do; if not, the import below says what is missing
+    # In a notebook it would start a window system for browsers, which nothing here draws with, and say so.
+    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
     try:
         import open3d
     except (ImportError, OSError) as error:

@@ -294,6 +294,7 @@ MORE = [
     Command("view HERE/nowhere", words="nowhere: no such folder"),
     Command("view HERE/predictions", words="made by `predict`"),
     Command("view HERE/bad/folder", words="folder"),
+    Command("view HERE/dense --rerun HERE/made/run.mp4", words="does not end in .rrd"),
     Command("view HERE/bad/text.txt", words="not a folder"),
     Command("view", 2, "missing: RUN"),
     Command(f"{VIEW} --port 65536", words="--port: 65536"),

@@ -32,8 +32,8 @@ def check_self_contained(path: Path) -> References:
     assert not {"link", "iframe", "base"} & set(page.tags)  # of programs it has its own alone: none has an address
     assert not re.search(r"https?://|url\(|@import", text)
     for address in page.pictures:
-        assert re.match("data:image/(png|jpeg);base64,", address)
-        assert base64.b64decode(address.split(",", 1)[1]).startswith((b"\x89PNG", b"\xff\xd8"))
+        assert re.match("data:image/(png|jpeg|webp);base64,", address)
+        assert base64.b64decode(address.split(",", 1)[1]).startswith((b"\x89PNG", b"\xff\xd8", b"RIFF"))
     folder = path.parent.resolve()
     assert all((folder / link).is_file() and (folder / link).resolve().is_relative_to(folder) for link in page.links)
     return page

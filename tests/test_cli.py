@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from pages import check_self_contained
 from scenes import cylinder
+from test_scene import scene_in
 
 from lightdepth.camera import Pinhole
 from lightdepth.cli import main
@@ -188,9 +189,15 @@ def test_evaluate_writes_the_tables_into_the_run_and_again_without_asking(run, d
     assert [line.split("|")[1].strip() for line in lines[2:5]] == ["map 0", "map 1", "all"] and len(lines) < 15
     assert shown.splitlines()[-1] == f"written: {run}/evaluation; open {run}/evaluation/report.html"
     page = (run / "evaluation" / "report.html").read_text(encoding="utf-8")
-    assert check_self_contained(run / "evaluation" / "report.html").tags.count("img") == 3  # curves, two surfaces
+    assert (
+        check_self_contained(run / "evaluation" / "report.html").tags.count("img") == 2
+    )  # curves, and a surface where no scene can be drawn
     assert all(f">{cell.strip()}<" in page for cell in lines[4].split("|")[1:-1])
-    assert 'href="map_000_error.ply"' in page and "coloured by its distance to the true surface" in page
+    assert (
+        'href="map_000_error.ply"' in page
+        and "coloured by its distance to the true surface" in page
+        and scene_in(page)["surfaces"][1]["title"] == "map_001"
+    )
     rows = json.loads((run / "evaluation" / "metrics.json").read_text())["maps"]
     assert all(row["sparse"]["rms_mm"] > 5 * row["dense"]["rms_mm"] for row in rows)
     assert lightdepth("evaluate", run, "--truth", data) == 0

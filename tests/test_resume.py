@@ -25,7 +25,7 @@ from videos import CAMERA, picture
 import densify.commands.densify
 import densify.densified
 import densify.page
-import densify.scene
+import lightdepth.reporting.scene
 from densify.bench.scenes import Scene
 from densify.commands import bench
 from densify.commands.sparse import sparse as sparse_verb
@@ -267,7 +267,7 @@ class Summed:
     def of(cls, *arrays: np.ndarray, **_: np.ndarray) -> Summed:
         return cls(*arrays)
 
-    def picture(self, *colors: np.ndarray) -> np.ndarray:
+    def cutout(self, *colors: np.ndarray) -> np.ndarray:
         every = b"".join(a.tobytes() for a in (*self.arrays, *colors) if a is not None)
         return np.full((1, 1, 3), zlib.crc32(every) / 2**32)
 
@@ -281,7 +281,7 @@ def test_densify_goes_on_with_the_light_and_the_submaps_that_it_has(
     write_synthetic(frames, slam(frames, maps=2, shared_keyframes=2), tmp_path / "data")
     (tmp_path / "data" / "light.json").unlink()
     monkeypatch.setattr(densify.page, "MeshView", Summed)
-    monkeypatch.setattr(densify.scene, "MeshView", Summed)
+    monkeypatch.setattr(lightdepth.reporting.scene, "MeshView", Summed)
     done, coarse = [], FusionConfig(voxels_per_distance=20.0)
     real = densify.densified.densify_or_empty
     monkeypatch.setattr(

@@ -18,7 +18,8 @@ from densify.evaluation.records import ErrorMesh
 from densify.judging.verdict import Verdict
 from densify.page import FILES, Gallery, _surfaces, densify_page
 from densify.pipeline import SubmapResult, densify
-from densify.scene import PICTURES, Thumbnails, scene_of, surface_of
+from densify.scene import surface_of
+from densify.thumbnails import PICTURES, Thumbnails, said
 from lightdepth.reporting.figures import jpeg
 from lightdepth.reporting.names import names_of
 from lightdepth.reporting.report import Report
@@ -58,7 +59,7 @@ def grid(side: int) -> tuple[np.ndarray, np.ndarray]:
 def test_the_scene_of_a_report_has_the_surfaces_triangles_its_places_and_its_colours(made, tmp_path):
     result, gallery = made
     dense, page = result.dense, tmp_path / "report.html"
-    scene = scene_of([surface_of("map 0", result.dense)], gallery.thumbnails.found)
+    scene = Scene.of([surface_of("map 0", result.dense)], gallery.thumbnails.found)
     report = Report("A surface")
     report.scene(replace(scene, most=len(dense.triangles)))
     report.write(page)
@@ -102,7 +103,9 @@ def test_the_scene_has_the_cameras_of_the_path_the_points_by_kind_and_the_errors
     titles = [layer["title"] for layer in told["layers"]]
     assert titles == ["Of the images", "Shape alone", "Confidence", "How well seen", "Error"]
     assert [picture["name"] for picture in scene["pictures"]] == [k.name for k in keyframes]
-    assert all(unpacked(p[kind])[:2].tolist() == [0xFF, 0xD8] for p in scene["pictures"] for kind in ("image", "depth"))
+    shown = ("image", "distance", "residual")
+    assert all(unpacked(p[kind])[:2].tolist() == [0xFF, 0xD8] for p in scene["pictures"] for kind in shown)
+    assert not any("uncertainty" in p for p in scene["pictures"]) and scene["kinds"] == said()  # truth is never unsure
 
 
 def test_joined_surfaces_come_first_and_submaps_that_are_in_none_after_them(made):
@@ -112,9 +115,9 @@ def test_joined_surfaces_come_first_and_submaps_that_are_in_none_after_them(made
         return replace(result, dense=replace(dense, submap=replace(dense.submap, id=number)))
 
     merged = SimpleNamespace(results=[numbered(0), numbered(1, empty)], groups=[{2: None, 0: None}, {3: None, 4: None}])
-    found = scene_of(_surfaces([numbered(i) for i in range(5)], merged, []))
+    found = Scene.of(_surfaces([numbered(i) for i in range(5)], merged, []))
     assert [s.title for s in found.surfaces] == ["joined_000: maps 0, 2 as one", "map 1", "map 3", "map 4"]
-    assert scene_of(_surfaces([numbered(0, empty)], None, [])) is None
+    assert Scene.of(_surfaces([numbered(0, empty)], None, [])) is None
 
 
 def test_a_report_with_a_scene_refers_to_nothing_outside_fits_a_phone_and_has_words_for_its_pictures(made, tmp_path):
@@ -126,7 +129,7 @@ def test_a_report_with_a_scene_refers_to_nothing_outside_fits_a_phone_and_has_wo
     page.files(tmp_path, FILES)
     page.write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    without = re.sub(r'src="data:image/(png|jpeg);base64,[^"]+"', "", text)
+    without = re.sub(r'src="data:image/(png|jpeg|webp);base64,[^"]+"', "", text)
     assert not re.search(r"//|url\(|@import|\bimport\b|\beval\b|\bfetch\b|<link|<iframe|\ssrc=", without)
     links = re.findall(r'href="([^"]+)"', text)
     assert links == ["map_000/mesh.ply", "map_000/keyframes.csv", "config.yaml", "log.txt", "run.json"]
@@ -140,7 +143,7 @@ def test_a_report_with_a_scene_refers_to_nothing_outside_fits_a_phone_and_has_wo
 
 def test_a_report_that_is_made_twice_is_the_same_to_the_byte(made, tmp_path):
     result, gallery = made
-    scene = replace(scene_of([surface_of("map 0", result.dense)], gallery.thumbnails.found), most=1500)
+    scene = replace(Scene.of([surface_of("map 0", result.dense)], gallery.thumbnails.found), most=1500)
     assert len(result.dense.triangles) > 2 * 1500
     assert scene.text() == scene.text() != replace(scene, most=1400).text()
 

@@ -26,6 +26,7 @@ from view_runs import AT, CANARY, LENGTH, RADIUS, dense_tube, tube, write_frames
 from densify.commands.measure import measure
 from densify.dense_map import DenseMap
 from lightdepth.errors import InputError, MachineFailure
+from lightdepth.files.images import write_image
 from lightdepth.files.lock import locked
 from lightdepth.files.replacing import unfinished_path
 from lightdepth.reporting.scene import Layer
@@ -89,6 +90,17 @@ def sent(here) -> str:
     with buffer.buffer_lock:
         messages = list(buffer.message_from_id.values())
     return "\n".join(repr(message.as_serializable_dict([])) for message in messages)
+
+
+def test_what_was_predicted_of_a_keyframe_stands_below_its_picture_where_that_was_written(tmp_path):
+    run = write_run(tmp_path / "run", write_frames(tmp_path / "frames"))
+    (run / "keyframes").mkdir()
+    write_image(run / "keyframes" / "000001.jpg", np.full((30, 96, 3), 120, np.uint8))
+    with viewing(run) as found:
+        for row, there in ((0, False), (1, True), (2, False)):
+            found.viewer._on_camera("map_000", row)
+            assert (found.panel.row.visible, found.panel.row_said.visible) == (there, there)
+        assert found.panel.picture.visible and "uncertainty" in found.panel.row_said.content
 
 
 def test_the_surface_that_is_drawn_is_that_of_the_file_with_its_colours_in_linear_light(shown, run):

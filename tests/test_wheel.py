@@ -25,6 +25,9 @@ def project(tmp_path_factory) -> Path:
     copy = tmp_path_factory.mktemp("copy") / "project"
     aside = shutil.ignore_patterns(".*", "*.egg-info", "__pycache__", "runs", "build", "dist")
     shutil.copytree(ROOT, copy, ignore=aside, symlinks=True)
+    shutil.rmtree(copy / "site", ignore_errors=True)
+    (copy / "site").mkdir()
+    (copy / "site" / "index.html").write_text("what make docs made")
     for left in ("runs/mine", "realdata", "shared/realdata"):
         (copy / left).mkdir(parents=True)
         (copy / left / "patient.png").write_bytes(b"a picture")
@@ -92,11 +95,12 @@ def test_the_licence_and_the_command_are_in_the_wheel(names):
 
 
 def test_the_sdist_has_tests_presets_pages_and_cards_and_nothing_of_runs_or_real_data(in_sdist):
-    for part in ("tests/golden", "configs", "docs", "data"):
+    for part in ("tests/golden", "configs", "docs", "data", "notebooks"):
         whole = {str(p.relative_to(ROOT)) for p in (ROOT / part).rglob("*") if p.is_file() and p.suffix != ".pyc"}
         assert whole and whole <= in_sdist
     assert {f"tests/{p.name}" for p in (ROOT / "tests").glob("*.py")} <= in_sdist
     assert {"README.md", "CHANGELOG.md", "LICENSE", "constraints.txt", "pyproject.toml"} <= in_sdist
+    assert {"site/index.html", "mkdocs.yml"} <= in_sdist  # to be read without a network, or made again
     assert not [name for name in in_sdist if name.endswith("patient.png") or name.startswith("runs/")]
 
 

@@ -146,6 +146,12 @@ class Board(pl.Callback):
 
 def row_of(batch: FrameBatch, rendered: Tensor, seen: Seen, i: int) -> np.ndarray:
     """The labelled panels of a frame, (H, W, 3) uint8."""
+    panels = panels_of(batch, rendered, seen, i)
+    return np.concatenate([_labelled(panel, label) for label, panel in panels.items()], 1)
+
+
+def panels_of(batch: FrameBatch, rendered: Tensor, seen: Seen, i: int) -> dict[str, np.ndarray]:
+    """The panels of a frame, (H, W, 3) uint8 each, by their labels."""
     mask = _flat(batch.mask[i])
     panels = {
         f"frame {i + 1}": _eight_bits(batch.image[i]),
@@ -158,7 +164,7 @@ def row_of(batch: FrameBatch, rendered: Tensor, seen: Seen, i: int) -> np.ndarra
     else:
         panels["no truth"] = np.zeros_like(panels["rendered"])
     panels["off the truth" if seen.has_truth[i] else "off closed form"] = _signed(seen.residual[i], mask)
-    return np.concatenate([_labelled(panel, label) for label, panel in panels.items()], 1)
+    return panels
 
 
 def decline(batch: FrameBatch, seen: Seen, count: int) -> Any:
@@ -183,6 +189,9 @@ def decline(batch: FrameBatch, seen: Seen, count: int) -> Any:
     axes.plot(ends, ends**-2.0, color="black", linewidth=1, label="inverse square")
     axes.set_xscale("log")
     axes.set_yscale("log")
+    ticks = [0.25, 0.5, 1, 2, 4]  # those of a decade lie over each other here
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_xticks([], minor=True)
     axes.set_xlabel("distance over the frame's median")
     axes.set_ylabel("linear brightness over its median")
     axes.legend(frameon=False, fontsize=8, markerscale=6)

@@ -1,7 +1,7 @@
 """The training run: a model, its data and a folder in; checkpoints, an exported model and a record of the run out.
 
 OUT/  config.yaml  log.txt  tensorboard/  checkpoints/{last,last-previous,best}.ckpt  model.safetensors  model.md
-      run.json  uncertainty.png (where the network has that head, and validation frames have truth)
+      report.html  run.json  uncertainty.png (where the network has that head, and validation frames have truth)
 
 `best` is the lowest validation criterion, which needs no truth. run.json is written last, by rename: its presence means
 the run is complete.
@@ -51,6 +51,7 @@ from .costs import training_steps
 from .datamodule import FrameDataModule, warn
 from .folder import begin_in, first_process, has_checkpoint, training_folder
 from .going_on import settings_before, warn_of_length, warn_of_settings
+from .report import FILES, show_frames, training_page
 from .requeue import requeued
 from .running import NO_ROOT, quiet
 from .trainer_options import check_trainer_options
@@ -245,6 +246,13 @@ def _exported(
     save_model(exported.network, folder / "model.safetensors", card.record())
     output = output_of(folder) or folder
     write_whole(folder / "model.md", card.text(output.name))
+    page = training_page([card.trained_on, f"{steps} steps, seed {job.seed}; the {chosen.stem} checkpoint."], errors)
+    if (batch := next(iter(data.val_dataloader()), None)) is not None:
+        pictured = (folder / "uncertainty.png").read_bytes() if doubt is not None else None
+        device = next(exported.network.parameters()).device
+        show_frames(page, exported.network, batch.to(device), model.loss_config, pictured)
+    page.files(folder, FILES)
+    write_whole(folder / "report.html", page.write)
     echo(f"exported the {chosen.stem} checkpoint to {output / 'model.safetensors'}")
     return {
         "seed": job.seed,

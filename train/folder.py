@@ -39,7 +39,7 @@ from lightdepth.reporting.unfinished import begin, begun_with
 from .checkpoints import BEST, LAST, PREVIOUS
 
 _OURS = (
-    *("config.yaml", "log.txt", "tensorboard", "csv", "checkpoints", "model.safetensors", "model.md"),
+    *("config.yaml", "log.txt", "tensorboard", "csv", "checkpoints", "model.safetensors", "model.md", "report.html"),
     *("uncertainty.png", INPUTS),
 )
 """What a run writes, besides run.json and begun.json."""

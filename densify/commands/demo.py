@@ -39,7 +39,7 @@ def demo(
     size: Annotated[tuple[int, int], at_least(8, up_to=10_000)] = (320, 256),
     lens: Lens = "c3vd",
     spurious: Annotated[float, BELOW_ONE] = 0.3,
-    wrong_side: Annotated[float, Range(0.1, 10)] = 1.4,
+    wrong_side: Annotated[float, Range(0.1, 10)] = 1.22,
     overwrite: bool = False,
 ) -> None:
     """The whole way on a synthetic colon: render, sparse map, densify, evaluate; a good surface and a bad one.

@@ -12,6 +12,7 @@ from densify.costs import surface_steps, surfaces_of
 from densify.inputs import MapSource, doubts_of_inputs, fitted_light, map_and_frames
 from densify.live.play import play
 from densify.live.record import PlayedRun
+from densify.thumbnails import images_alone
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
@@ -79,5 +80,5 @@ def live(
         result = PlayedRun(run, config.coverage, mm_per_unit, config.judge.on, doubts)
         with Progress("Playing", sum(len(s.keyframes) for s in sparse_map.submaps)) as bar:
             played = play(frames, sparse_map, model, config, result.add, rate, lambda _: bar.advance())
-        result.finish(played, model.name, rate, budget_ms)
+        result.finish(played, model.name, rate, budget_ms, images_alone(frames, sparse_map))
     end(output, then=f"lightdepth view {quote(str(output))}", page=output / "report.html")

@@ -1,13 +1,16 @@
-"""The verb view: a run in a browser."""
+"""The verb view: a run in a browser, or as a recording."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 from densify.scene import TRIANGLES
-from lightdepth.command_line.outcome import end
+from lightdepth.command_line.outcome import end, outcome
 from lightdepth.errors import InputError
+from lightdepth.files.replacing import check_rewritable
+from lightdepth.files.writing import write_whole
 from lightdepth.ranges import above, at_least
 from lightdepth.signals import finishing_first
 
@@ -19,6 +22,7 @@ def view(
     data: Path | None = None,
     mm_per_unit: Annotated[float | None, above(0)] = None,
     triangles: Annotated[int, at_least(100)] = TRIANGLES,
+    rerun: Path | None = None,
 ) -> None:
     """A run in a browser: surfaces, points, cameras with their pictures, lengths between two clicks.
 
@@ -34,7 +38,12 @@ def view(
             in mm. A larger one makes them longer in proportion. It is refused where the surface is in mm already.
         triangles: Number of triangles that are drawn of each surface at most; lengths are measured on all that there
             are. More show finer detail and take a browser longer.
+        rerun: File, ending in .rrd, to write as a recording for the Rerun viewer (extra `rerun`), with the images, in
+            the place of a page to open. Left out, none is written.
     """
+    if rerun is not None:
+        _record(run, data, mm_per_unit, triangles, rerun)
+        return
     try:
         from densify.viewing.work import Viewing
     except ModuleNotFoundError as error:
@@ -44,3 +53,26 @@ def view(
         viewing.serve(host, port, received)
         end(then="lightdepth measure RUN --points '[[X, Y, Z], [X, Y, Z]]' -o lengths.json", result=viewing.result)
         received.stop("nothing was written")
+
+
+def _record(run: Path, data: Path | None, mm_per_unit: float | None, triangles: int, output: Path) -> None:
+    """Writes a recording of the maps that there are now."""
+    try:
+        from densify.viewing.recording import BEGINNING, write_recording
+    except ModuleNotFoundError as error:
+        raise InputError("--rerun", f"{error.name} is not installed", "pip install 'lightdepth[rerun]'") from error
+    from densify.viewing.known import known_of
+    from densify.viewing.watched import WatchedRun
+
+    if output.suffix != ".rrd":
+        raise InputError("--rerun", f"{output} does not end in .rrd", "the Rerun viewer opens no other files")
+    check_rewritable(output, BEGINNING, [run, data])
+    watched = WatchedRun(run, triangles)
+    if not (maps := watched.first()):
+        raise InputError(run, "no surface yet", "begin again when the run has finished its first map")
+    known = known_of(watched, data, mm_per_unit)
+    write_whole(output, lambda path: write_recording(path, maps, known))
+    for note in known.notes:
+        outcome().last(note)
+    result = {"recording": str(output), "maps": [each.name for each in maps], "unit": known.unit}
+    end(output, then=f"rerun {quote(str(output))}", result=result)

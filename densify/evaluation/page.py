@@ -7,12 +7,14 @@ from pathlib import Path
 
 from densify.evaluation.files import CURVES, prefix_of
 from densify.evaluation.in_short import not_judged, short_tables
+from densify.evaluation.pictures import error_surface
 from densify.evaluation.records import DepthJudged, Evaluation, MapsJudged, Sources
 from densify.evaluation.suite import Suite
 from densify.evaluation.tables import Table, notes_of, tables_of
 from densify.judging.withheld import WithheldOfMap
 from lightdepth.reporting.figures import Chart
 from lightdepth.reporting.report import Report
+from lightdepth.reporting.scene import Scene
 
 FILES = {
     "metrics.md": "every table",
@@ -21,6 +23,8 @@ FILES = {
     "metrics.json": "every figure, for programs",
     f"*{CURVES}.csv": "share of model points, or of pixels, within each error",
     "*_error.ply": "the surface, coloured by its error",
+    "*[0-9]_error.png": "a picture of that",
+    f"*{CURVES}.png": "the same as curves",
 }
 
 _LONG = 120
@@ -63,17 +67,19 @@ def evaluation_page(
         pictures: list[tuple[bytes, str]] = []
         if evaluation.curves:
             share = "pixels" if isinstance(evaluation.judged, DepthJudged) else "model points"
-            caption = f"{of}share of {share} within each error"
+            caption = f"{of or 'Share'}{of and 'share'} of {share} within each error"
             pictures.append((Chart((folder / f"{prefix}{CURVES}.png").read_bytes()), caption))
-        for mesh in evaluation.meshes:
-            caption = f"{of}{mesh.name}, coloured by its distance to the true surface"
-            pictures.append(((folder / f"{prefix}{mesh.name}_error.png").read_bytes(), caption))
-        if pictures:
+        scene = Scene.of([*map(error_surface, evaluation.meshes)])
+        if pictures or scene is not None:
             report.heading(f"Where it errs{f', {name}' if len(found) > 1 else ''}")
-            report.wide_figures(pictures)
+        if scene is not None:
+            report.text("Each surface, in the true world, is coloured by its distance to the true surface.")
+            report.scene(scene)
+        report.wide_figures(pictures)
     _show(report, [table for table in tables_of(found, withheld, suite) if table not in short])
-    report.heading("What the figures mean")
-    for note in notes_of(found, sources):
+    if notes := notes_of(found, sources):
+        report.heading("What the figures mean")
+    for note in notes:
         report.text(note)
     report.files(folder, FILES)
     return report
@@ -82,7 +88,7 @@ def evaluation_page(
 def _show(report: Report, tables: Sequence[Table]) -> None:
     for table in tables:
         name, _, rest = table.title.partition(": ") if len(table.title) > _LONG else (table.title, "", "")
-        report.heading(name)
+        report.heading(name.rstrip("."))
         if rest:
             report.text(f"{rest[0].upper()}{rest[1:]}")
         report.table(table.headers, table.rows)

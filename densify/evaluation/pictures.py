@@ -10,7 +10,8 @@ import numpy as np
 
 from densify.evaluation.records import EDGES_MM, DepthJudged, ErrorMesh, Evaluation, MapsJudged
 from lightdepth.files.meshes import load_mesh, vertex_columns
-from lightdepth.reporting.figures import MeshView, chart, chart_png, png, side_by_side
+from lightdepth.reporting.figures import PLAIN, MeshView, chart, chart_png, outside_axes, png, side_by_side
+from lightdepth.reporting.scene import Layer, Surface, bytes_of
 
 MODELS = {"sparse": "Sparse map", "sparse_inliers": "Sparse inliers", "dense": "Dense"}
 """The names of the point clouds, for people."""
@@ -39,6 +40,20 @@ def error_colors(distance: np.ndarray) -> np.ndarray:
     """(n, 3) in [0, 1]: from blue (0) over green and yellow to red (5 mm and more)."""
     level = np.rint(255 * (0.08 + 0.87 * np.clip(distance / FARTHEST_COLOR_MM, 0, 1))).astype(np.uint8)
     return cv2.applyColorMap(level.reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0, ::-1] / 255
+
+
+def error_layer(distance: np.ndarray) -> Layer:
+    """The colours of a surface whose vertices are at `distance` (n,) [mm] from the truth."""
+    far = FARTHEST_COLOR_MM
+    marks = ((0.0, "off by 0 mm"), (0.5, f"{far / 2:g} mm"), (1.0, f"{far:g} mm and more"))
+    return Layer("Error", bytes_of(distance / far), bytes_of(error_colors(far * np.linspace(0, 1, 256))), marks)
+
+
+def error_surface(mesh: ErrorMesh) -> Surface:
+    """The surface in the true world, by its error first and by its shape alone."""
+    shape = Layer("Shape alone", None, bytes_of(np.array([PLAIN])))
+    axes = outside_axes(mesh.vertices) if len(mesh.vertices) else np.eye(3)
+    return Surface(mesh.name, mesh.vertices, mesh.triangles, (error_layer(mesh.distance), shape), axes=axes)
 
 
 def write_error_mesh(mesh: ErrorMesh, path: Path) -> None:

@@ -21,13 +21,20 @@ FILES = {
 
 
 def live_page(
-    verdict: str, judged: Mapping[int, Ahead], played: Sequence[Played], timings: bytes, scene: Scene | None = None
+    verdict: str,
+    judged: Mapping[int, Ahead],
+    played: Sequence[Played],
+    notes: Sequence[str],
+    timings: bytes,
+    scene: Scene | None = None,
 ) -> Report:
-    """The whole page; `verdict` in words and `judged` by map, empty where nothing was, `timings` the picture of them
-    (PNG), `scene` the finished surfaces."""
+    """The whole page; `verdict` in words and `judged` by map, empty where nothing was, `notes` sentences on what was
+    played and how long it took, `timings` the picture of that (PNG), `scene` the finished surfaces."""
     page = Report("Live surfaces")
     if verdict:
         page.text(f"Verdict: {verdict}.")
+    for note in notes:
+        page.text(note)
     if scene is not None:
         page.heading("The surface in three dimensions")
         page.scene(scene)
@@ -65,16 +72,17 @@ def _agreement(page: Report, judged: Mapping[int, Ahead], played: Sequence[Playe
 
 
 def _running_picture(judged: Mapping[int, Ahead], played: Sequence[Played]) -> bytes:
-    figure, axes = chart((9.0, 2.6))
+    figure, axes = chart((7.2, 2.6))
     place = np.arange(len(played))
     for count, number in enumerate(judged):
         rows = np.array([p.map == number for p in played])
         medians = 100 * running([p.ahead for p in played if p.map == number])
-        for column, (color, label) in enumerate((("#2a6f97", "as fused"), ("#b8b8b8", "constant distance"))):
+        for column, (color, label) in enumerate((("#2a6f97", "as fused"), ("#8c8c8c", "constant distance"))):
             axes.plot(place[rows], medians[:, column], color=color, label=None if count else label)
     axes.set_xlim(-0.5, len(played) - 0.5)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("keyframe")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylabel("off by [%]")
     axes.legend(frameon=False, fontsize=8)
     return chart_png(figure)

@@ -28,7 +28,7 @@ from lightdepth.reporting.figures import chart, chart_png
 from lightdepth.sparse_map import Keyframe, SparseMap, Submap
 
 ALL_STEPS = ("read", *STEPS)
-_COLORS = ("#b8b8b8", "#2a6f97", "#8a6fb0", "#e09f3e", "#9e2a2b", "#5a8f5a")
+_COLORS = ("#8c8c8c", "#2a6f97", "#8a6fb0", "#e09f3e", "#9e2a2b", "#5a8f5a")
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,8 +241,9 @@ def write_timings(played: Sequence[Played], path: Path) -> None:
 
 
 def timings_picture(played: Sequence[Played], budget: float) -> bytes:
-    """PNG: what each keyframe's time went into, on the clock, beside the budget [s] and the processor time."""
-    figure, axes = chart((9.0, 3.6))
+    """PNG: what each keyframe's time went into, on the clock, beside the budget [s] and the processor time. The longest
+    ones, of which the first waits for compilers, are cut off: the others would be too low to read."""
+    figure, axes = chart((7.2, 3.6))
     place = np.arange(len(played))
     bottom = np.zeros(len(played))
     names = {"predict": "inference", "judge": "judge", "align": "alignment", "integrate": "integration"}
@@ -259,8 +260,11 @@ def timings_picture(played: Sequence[Played], budget: float) -> bytes:
         if played[before].map != played[after].map:
             axes.axvline(after - 0.5, color="white", linewidth=1)
     axes.set_xlim(-0.5, len(played) - 0.5)
-    axes.set_ylim(0, max(1.15 * 1000 * budget, 1.05 * float(np.quantile(bottom, 0.99))))
+    if bottom.max() > (top := max(1.15 * 1000 * budget, 1.15 * float(np.quantile(bottom, 0.9)))):
+        axes.plot([], [], " ", label=f"longest {bottom.max():.0f} ms")
+    axes.set_ylim(0, top)
     axes.set_xlabel("keyframe")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_ylabel("ms")
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False, reverse=True)
     return chart_png(figure)

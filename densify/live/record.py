@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 from densify.coverage import Coverage, CoverageConfig
 from densify.coverage import coverage as coverage_of
@@ -12,11 +13,12 @@ from densify.judging.verdict import doubted, headline, worst
 from densify.judging.withheld import Withheld
 from densify.live.page import FILES, live_page
 from densify.live.play import Finished, Played, time_spent, timings_picture, write_timings
-from densify.scene import TRIANGLES, scene_of, surface_of
+from densify.scene import TRIANGLES, seen_kinds, surface_of
+from lightdepth.counting import counted
 from lightdepth.depth_gate import sentence
 from lightdepth.errors import InputError
 from lightdepth.reporting.run import Run, plain
-from lightdepth.reporting.scene import Surface
+from lightdepth.reporting.scene import Picture, Scene, Surface
 
 
 @dataclass(frozen=True)
@@ -79,10 +81,20 @@ class PlayedRun:
             self._run.fail(name, next((a.reason for a in dense.alignments if a.reason), "nothing was fused"))
             return
         self._surfaces.append(surface_of(f"map {dense.submap.id}", dense).thinned(TRIANGLES))
-        replace(dense, unit="mm" if scale else dense.unit).write(self._run.folder / name, ("ply",), scale)
+        replace(dense, unit="mm" if scale else dense.unit).write(
+            self._run.folder / name, ("ply",), scale, seen_kinds(dense)
+        )
 
-    def finish(self, played: Sequence[Played], model: str, rate: float | None, budget_ms: float) -> None:
-        """Writes timings, page and record. Raises InputError where no keyframe of any map could be aligned."""
+    def finish(
+        self,
+        played: Sequence[Played],
+        model: str,
+        rate: float | None,
+        budget_ms: float,
+        images: Mapping[str, Picture] = MappingProxyType({}),
+    ) -> None:
+        """Writes timings, page and record; `images` are those of keyframes by name, for the page. Raises InputError
+        where no keyframe of any map could be aligned."""
         run = self._run
         for p in played:
             if p.unread:
@@ -115,15 +127,21 @@ class PlayedRun:
         run.record["doubted"] = doubts = {p.keyframe: p.doubt for p in played if p.doubt}
         if doubts:
             run.log(sentence(doubts, len(played)))
-        page = live_page(said, judged, played, picture, scene_of(self._surfaces))
-        page.files(run.folder, FILES)
-        page.write(run.folder / "report.html")
         timings = spent.timings
         assert timings is not None, "a surface has keyframes that were read"
-        run.log(
+        time_said = (
             f"{timings.share_in_budget:.0%} of {spent.read} keyframes within {budget_ms:g} ms; median ms: "
             + ", ".join(f"{step} {figures.median_ms:.1f}" for step, figures in timings.steps.items())
             + f"; without the network {timings.without_network.median_ms:.1f}"
         )
+        run.log(time_said)
+        notes = [
+            f"{counted(len(played), 'keyframe')} of {counted(len(self._records), 'submap')} came one by one, as in a "
+            f"procedure; depth by {model}. Lengths are in {unit}.",
+            f"{time_said[0].upper()}{time_said[1:]}.",
+        ]
         if rate is not None:
             run.log(f"at {rate:g} keyframes per second, {timings.share_in_time:.0%} were on the surface in that time")
+        page = live_page(said, judged, played, notes, picture, Scene.of(self._surfaces, images))
+        page.files(run.folder, FILES)
+        page.write(run.folder / "report.html")

@@ -13,11 +13,10 @@ import numpy as np
 import viser
 from viser import transforms
 
+from densify.viewing.places import CHOSEN, LEFT_OUT, PATH, USED, centers, extent, vertex_colors
 from densify.viewing.watched import ViewedMap
 from lightdepth.reporting.scene import Layer, Pose, Surface
 
-USED, LEFT_OUT, CHOSEN, PATH = (41, 128, 217), (140, 140, 140), (255, 158, 26), (41, 128, 217)
-"""Colours of cameras and of the path, those of a report's scene."""
 MOST_CAMERAS = 200
 """Cameras that are drawn of a map; of more, some are left out evenly."""
 
@@ -37,11 +36,8 @@ def gltf(surface: Surface, layer: Layer, through: bool) -> bytes:
     """A surface as binary glTF in the colours of a layer; `through` leaves out triangles that are seen from behind."""
     import trimesh
 
-    colors = layer.colors()
-    plain = np.broadcast_to(_one_color(layer), (len(surface.vertices), 3))
-    light = np.where(
-        (shown := plain if colors is None else colors) > 0.04045, ((shown + 0.055) / 1.055) ** 2.4, shown / 12.92
-    )
+    shown = vertex_colors(layer, len(surface.vertices))
+    light = np.where(shown > 0.04045, ((shown + 0.055) / 1.055) ** 2.4, shown / 12.92)
     mesh = trimesh.Trimesh(
         surface.vertices, surface.triangles, vertex_colors=np.rint(255 * light).astype(np.uint8), process=False
     )
@@ -55,21 +51,6 @@ def gltf(surface: Surface, layer: Layer, through: bool) -> bytes:
     data = mesh.export(file_type="glb", include_normals=True, tree_postprocessor=finish)
     assert isinstance(data, bytes)
     return data
-
-
-def _one_color(layer: Layer) -> np.ndarray:
-    return np.full(3, 0.8) if layer.palette is None else layer.palette[0] / 255
-
-
-def extent(surface: Surface) -> float:
-    """The longest side of the box around a surface."""
-    return float(np.ptp(surface.vertices, axis=0).max()) if len(surface.vertices) else 1.0
-
-
-def centers(surface: Surface) -> np.ndarray:
-    """Where its cameras were (n, 3)."""
-    poses = [p.cam_from_map for p in surface.poses]
-    return np.array([-p[:3, :3].T @ p[:3, 3] for p in poses]).reshape(-1, 3)
 
 
 class DrawnMap:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from densify.thumbnails import said
 from densify.viewing.drawn import Parts
 from lightdepth.foreign_text import for_terminal
 from lightdepth.reporting.scene import Layer, Surface
@@ -38,6 +39,8 @@ class Panel:
     outside: viser.GuiButtonHandle
     picture: viser.GuiImageHandle
     caption: viser.GuiHtmlHandle
+    row: viser.GuiImageHandle
+    row_said: viser.GuiHtmlHandle
     measuring: viser.GuiCheckboxHandle
     measured: viser.GuiHtmlHandle
     clear: viser.GuiButtonHandle
@@ -69,10 +72,11 @@ class Panel:
             inside = gui.add_checkbox("Look from inside", False, hint="From where the keyframe was taken")
             outside = gui.add_button("Look from outside")
             caption = gui.add_html("")
-            picture = gui.add_image(np.full((3, 4, 3), 200, np.uint8), visible=False)
+            picture, row = (gui.add_image(np.full((3, 4, 3), 200, np.uint8), visible=False) for _ in range(2))
+            row_said = gui.add_html(lines(f"From the left: {', '.join(said().values())}."), visible=False)
         return cls(
-            note, maps, together, layer, legend, parts, size, keyframe, inside, outside, picture, caption, measuring,
-            measured, clear,
+            note, maps, together, layer, legend, parts, size, keyframe, inside, outside, picture, caption, row,
+            row_said, measuring, measured, clear,
         )  # fmt: skip
 
     def chosen(self) -> Parts:

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import viser
 
 from densify.measure import Way
-from densify.viewing.drawn import CHOSEN, DrawnMap, extent
+from densify.viewing.drawn import DrawnMap
+from densify.viewing.known import Known
 from densify.viewing.panel import Panel, lines, put_value
 from densify.viewing.pictures import Pictures
+from densify.viewing.places import CHOSEN, extent
 from densify.viewing.ruler import Place, Ruler
 from densify.viewing.watched import State, ViewedMap
 from lightdepth.counting import counted
@@ -40,17 +41,6 @@ _SAID: dict[State, tuple[str, str]] = {
     "gone": ("The run is no longer in its place.",) * 2,
 }
 """What is said of a run's state: where there is a map, and where there is none."""
-
-
-@dataclass(frozen=True)
-class Known:
-    """What is known of a run beside its maps: the unit of lengths, the pictures of its keyframes, what is to be said of
-    both, and how it stands with the run."""
-
-    unit: str
-    pictures: Pictures
-    notes: tuple[str, ...] = ()
-    state: State = "finished"
 
 
 class Viewer:
@@ -171,7 +161,7 @@ class Viewer:
     def _station(self, wanted: tuple[str, int] | None) -> None:
         """Chooses a keyframe; one that is not there, the one at the slider's place."""
         if not self.stations:
-            self.panel.picture.visible = False
+            self.panel.picture.visible = self.panel.row.visible = self.panel.row_said.visible = False
             self.panel.caption.content = ""
             return
         if wanted in self.stations:
@@ -188,6 +178,10 @@ class Viewer:
         self.panel.picture.visible = picture is not None
         if picture is not None:
             self.panel.picture.image = picture
+        beside = self.known.pictures.row(number)
+        self.panel.row.visible = self.panel.row_said.visible = beside is not None
+        if beside is not None:
+            self.panel.row.image = beside
         state = "" if pose.used else ", left out of the surface"
         self.panel.caption.content = lines(f"{viewed.surface.title}, keyframe {pose.name}{state}")
 

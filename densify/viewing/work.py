@@ -10,14 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from densify.dense_map import map_folders
-from densify.measure import run_unit
-from densify.run_frames import run_frames
-from densify.scale_file import unit_told
+from densify.viewing.known import Known, known_of
 from densify.viewing.local_server import Listening, local_server
-from densify.viewing.pictures import Pictures
 from densify.viewing.ruler import Ruler
-from densify.viewing.viewer import Known, Viewer
+from densify.viewing.viewer import Viewer
 from densify.viewing.watched import ViewedMap, WatchedRun
 from lightdepth.command_line.heartbeat import at_work
 from lightdepth.command_line.outcome import Outcome, outcome
@@ -47,7 +43,7 @@ class Viewing:
             raise InputError(data, "no such file or folder", "give the frames that the run was made of")
         watched = WatchedRun(run, triangles)
         maps = tuple(watched.first())
-        known = _known(watched, data, mm_per_unit)
+        known = known_of(watched, data, mm_per_unit)
         return cls(watched, maps, known, data, mm_per_unit, {"maps": [m.name for m in maps], "lengths": []})
 
     def serve(self, host: str, port: int, received: Received) -> None:
@@ -71,7 +67,7 @@ class Viewing:
         if state == "gone":
             known = replace(known, state=state)
         elif found or gone or state != known.state:
-            known = _known(self.watched, self.data, self.mm_per_unit)
+            known = known_of(self.watched, self.data, self.mm_per_unit)
         if found or gone:
             viewer.put(found, gone)
         if known != viewer.known:
@@ -95,31 +91,3 @@ class Viewing:
         assert isinstance(lengths, list)
         lengths.append(dict(record))
         call.last(words)
-
-
-def _known(watched: WatchedRun, data: Path | None, mm_per_unit: float | None) -> Known:
-    """The unit of lengths, and the frames where they are found; none before there is a map."""
-    state, folder = watched.state, watched.folder
-    unit = run_unit(folder, mm_per_unit) if state == "finished" else _unit_meant(watched, mm_per_unit)
-    if not map_folders(folder):
-        return Known(unit, Pictures(), state=state)
-    try:
-        frames, missing = run_frames(folder, data, watched.record)
-    except InputError as error:
-        if data is not None:
-            raise
-        frames, missing = None, f"the run's frames cannot be read: {error}"
-    if missing:
-        warnings.warn(f"{missing}: cameras have no pictures; give --data", stacklevel=2)
-    notes = ("The run's frames are not there: cameras have no pictures.",) if missing else ()
-    return Known(unit, Pictures(frames), notes, state)
-
-
-def _unit_meant(watched: WatchedRun, mm_per_unit: float | None) -> str:
-    """As `run_unit`, of a run that is still at work."""
-    arguments = watched.record.get("arguments")
-    given = arguments.get("mm_per_unit") if isinstance(arguments, Mapping) else None
-    asked = given is not None and (given != "light" or unit_told(watched.folder) == "mm")
-    if asked and mm_per_unit is not None:
-        raise InputError(watched.folder, "its surfaces are in mm already", "leave --mm-per-unit out")
-    return "mm" if asked or mm_per_unit is not None else "map units"

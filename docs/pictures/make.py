@@ -10,20 +10,32 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-FIGURE = re.compile(r'src="data:image/(?:png|jpeg);base64,([^"]+)"[^>]*><figcaption>([^<]*)')
+FIGURE = re.compile(r'src="data:image/(?:png|jpeg|webp);base64,([^"]+)"[^>]*><figcaption>([^<]*)')
+TILES = re.compile(r'<figure class="tiles".*?</div><figcaption>')
 HERE = Path(__file__).parent
 HEIGHT, GAP = 300, 12
 
 
 def figures(report: Path, map_id: int) -> dict[str, np.ndarray]:
-    """The pictures (H, W, 3) of a map in a report, by the beginning of their caption."""
+    """The pictures (H, W, 3) of a map in a report, by the beginning of their caption, and its first row of tiles."""
     text = report.read_text(encoding="utf-8")
     section = text[text.index(f">Map {map_id}</h2>") :]
     found: dict[str, np.ndarray] = {}
-    for data, caption in FIGURE.findall(section):
-        picture = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-        found.setdefault(re.split(r"[:,;(]", caption)[0].strip(), picture)
+    for data, caption in FIGURE.findall(TILES.sub("", section)):
+        found.setdefault(re.split(r"[:,;(]", caption)[0].strip(), on_white(data))
+    tiles = TILES.search(section)
+    assert tiles is not None, f"{report}: map {map_id} has no pictures of keyframes"
+    found["keyframe"] = row([on_white(data) for data, _ in FIGURE.findall(tiles.group())])
     return found
+
+
+def on_white(data: str) -> np.ndarray:
+    """A picture (H, W, 3) from base64, white where it is clear."""
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_UNCHANGED)
+    if picture.shape[2] == 3:
+        return picture
+    share = picture[..., 3:] / 255
+    return np.rint(share * picture[..., :3] + 255 * (1 - share)).astype(np.uint8)
 
 
 def row(pictures: list[np.ndarray]) -> np.ndarray:
@@ -37,9 +49,8 @@ def row(pictures: list[np.ndarray]) -> np.ndarray:
 
 def main(run: Path) -> None:
     found = figures(run / "report.html", 1)
-    contact = next(picture for caption, picture in found.items() if re.fullmatch(r"\d+\.png", caption))
     inside = next(picture for caption, picture in found.items() if caption.startswith("From keyframe"))
-    cv2.imwrite(str(HERE / "frames.jpg"), row([contact, inside]), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    cv2.imwrite(str(HERE / "frames.jpg"), row([found["keyframe"], inside]), [cv2.IMWRITE_JPEG_QUALITY, 85])
     surface = found["Surface of map 1 from outside"]
     error = cv2.imread(str(run / "map_001_error.png"))
     cv2.imwrite(str(HERE / "surface.jpg"), row([surface, error]), [cv2.IMWRITE_JPEG_QUALITY, 85])

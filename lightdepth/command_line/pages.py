@@ -196,7 +196,7 @@ PAGES = {
     "view": Page(
         (
             "lightdepth view runs/dense",
-            "lightdepth view runs/live --port 8090 --data DATA",
+            "lightdepth view runs/live --data DATA --rerun live.rrd",
         )
     ),
     "completion": Page(

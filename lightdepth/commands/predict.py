@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -22,13 +23,14 @@ from lightdepth.errors import InputError
 from lightdepth.frame import Frame
 from lightdepth.hidden_uncertainty import read_factor
 from lightdepth.models import DepthModel
-from lightdepth.prediction import DepthPrediction
+from lightdepth.prediction import DepthPrediction, read_prediction
 from lightdepth.ranges import at_least
 from lightdepth.refine import RefineConfig, RefinedModel
 from lightdepth.reporting.batches import batches
 from lightdepth.reporting.figures import colored_distance, png, side_by_side, thumbnail
 from lightdepth.reporting.names import names_of
 from lightdepth.reporting.plan import seconds_each, times
+from lightdepth.reporting.predicted import predicted_page, spread
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.run import recorded, run_folder
 from lightdepth.uncalibrated import open_frames
@@ -119,7 +121,37 @@ def predict(
         run.record["colour"] = colours.record()
         run.record["checkpoint"] = model.name
         run.record["uncertainty_factor"] = factor
-    end(output, then=f"lightdepth export {quote(str(output))} -o runs/png --to png")
+        made = (
+            f"{len(frames) - len(run.record['failures'])} of {counted(len(frames), 'frame')} predicted by {model.name}"
+        )
+        run.log(made)
+        said = [f"{made}.", *(f"Warning: {warning}." for warning in run.record["warnings"])]
+        page = predicted_page(said, _facts(refine, factor, previews), _shown(run.folder, frames) if previews else [])
+        page.files(run.folder, {})
+        page.write(run.folder / "report.html")
+    end(output, then=f"lightdepth export {quote(str(output))} -o runs/png --to png", page=output / "report.html")
+
+
+def _facts(refine: int, factor: float | None, previews: bool) -> list[list[str]]:
+    found = [
+        ["files", "NAME.npz for each frame: distance (up to scale), where it is valid, albedo, normals, uncertainty"]
+    ]
+    found += [["refined", f"in {counted(refine, 'step')}"]] if refine else []
+    found += [["uncertainty", f"multiplied by {factor:.3g}"]] if factor is not None else []
+    return [
+        *found,
+        ["images of the patient", "in this page and in previews/" if previews else "none: --previews is false"],
+    ]
+
+
+def _shown(folder: Path, frames: FrameSequence) -> list[tuple[Frame, DepthPrediction]]:
+    """Some frames with what was written of them, as far as they could be read."""
+    found = []
+    for row in spread(len(frames)):
+        with suppress(InputError):
+            frame = frames[row]
+            found.append((frame, read_prediction(folder / f"{frame.name}.npz")))
+    return found
 
 
 def _steps(frames: FrameSequence, model: DepthModel, previews: bool) -> list[Step]:

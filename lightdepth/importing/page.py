@@ -12,8 +12,8 @@ from lightdepth.counting import counted
 from lightdepth.image_quality import Measures
 from lightdepth.importing.findings import Finding, exposure_jumps
 from lightdepth.importing.selection import KEPT
-from lightdepth.reporting.figures import BAD, GOOD, chart, chart_png, contact_sheet, png
-from lightdepth.reporting.report import Report
+from lightdepth.reporting.figures import BAD, GOOD, chart, chart_png, jpeg, png
+from lightdepth.reporting.report import SMALL, Report, Tile
 
 Picture = tuple[np.ndarray, str, bool]
 """A thumbnail (h, w, 3), its label, and whether the frame was kept."""
@@ -57,9 +57,8 @@ def import_page(
     page.figures(_charts(measures, fate, axis))
     if pictures:
         page.heading("Pictures")
-        colors = [GOOD if kept else BAD for _, _, kept in pictures]
-        sheet = contact_sheet([p for p, _, _ in pictures], [label for _, label, _ in pictures], colors)
-        page.wide_figures([(png(sheet), "Green: kept. Red: left out. What was blacked out is black here too.")])
+        tiles = [Tile(jpeg(picture), label, GOOD if kept else BAD) for picture, label, kept in pictures]
+        page.tiles(tiles, "Green: kept. Red: left out. What was blacked out is black here too.", SMALL)
     if tissue is not None:
         page.wide_figures([(png(np.repeat(tissue[..., None], 3, 2).astype(np.uint8) * 255), "White: taken as tissue.")])
     return page

@@ -13,6 +13,8 @@ import numpy as np
 from lightdepth import native
 
 GOOD, BAD, KEPT = (0, 200, 80), (235, 40, 40), (255, 170, 0)
+UNSURE = 0.3
+"""Predicted standard deviation of log distance from which on a pixel is yellow."""
 PLAIN = (0.82, 0.8, 0.78)
 """of a surface that is shown without its colour"""
 
@@ -28,6 +30,16 @@ def jpeg(image: np.ndarray, quality: int = 88) -> bytes:
     """JPEG of an RGB image (H, W, 3), uint8 or float in [0, 1]: of an image or a surface, a fifth of the PNG's size."""
     image = cv2.cvtColor(_eight_bits(image), cv2.COLOR_RGB2BGR)
     done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    return data.tobytes()
+
+
+def webp(image: np.ndarray, quality: int = 88) -> bytes:
+    """WebP of an RGB image (H, W, 3), or of one that is clear in places (H, W, 4), uint8 or float in [0, 1]: as small
+    as a JPEG, and the page shows where it is clear."""
+    image = _eight_bits(image)
+    image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR if image.shape[-1] == 3 else cv2.COLOR_RGBA2BGRA)
+    done, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
     assert done
     return data.tobytes()
 
@@ -70,6 +82,32 @@ def level_colors(shares: np.ndarray) -> np.ndarray:
     """Colours (n, 3) in [0, 1] of shares (n,) in [0, 1]: violet low, yellow high."""
     found: np.ndarray = _viridis(np.rint(255 * np.clip(shares, 0, 1))[:, None])[:, 0] / 255
     return found
+
+
+def signed_colors(level: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Errors (H, W), of which -1 and 1 have the full colour, as colours (H, W, 3) uint8: white right, red above 0, blue
+    below, grey where nothing is known."""
+    level = np.clip(level, -1, 1)[..., None]
+    red, blue = np.array([200, 20, 20]), np.array([20, 60, 200])
+    colors = np.where(level > 0, 255 + level * (red - 255.0), 255 - level * (blue - 255.0))
+    return np.where(known[..., None], colors, 120).astype(np.uint8)
+
+
+def uncertainty_colors(sigma: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Standard deviations of log distance (H, W) as colours (H, W, 3) uint8: violet sure, yellow unsure, black where
+    nothing is known."""
+    known = valid & np.isfinite(sigma)
+    level = np.where(known, sigma, 0) / UNSURE
+    colors = np.rint(255 * level_colors(level.ravel())).reshape(*level.shape, 3)
+    return np.where(known[..., None], colors, 0).astype(np.uint8)
+
+
+def normal_colors(normals: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Unit normals (H, W, 3) in camera axes as colours uint8: red to the right, green up, blue towards the camera;
+    black where there is none."""
+    known = valid & np.isfinite(normals).all(-1)
+    colors = 127.5 * (1 + np.where(known[..., None], normals, 0) * [1, -1, -1])
+    return np.where(known[..., None], np.rint(colors), 0).astype(np.uint8)
 
 
 def marked_points(
@@ -199,6 +237,10 @@ class MeshView:
         color = PLAIN if colors is None else np.einsum("kci,kc->ki", colors[self.corners], self.weights)
         picture[self.met] = np.rint(255 * np.clip(color * self.shade[:, None], 0, 1))
         return picture
+
+    def cutout(self, colors: np.ndarray | None = None) -> np.ndarray:
+        """The same (H, W, 4), clear where there is no surface: for pages, which are light or dark."""
+        return np.dstack([self.picture(colors), 255 * self.met.astype(np.uint8)])
 
 
 def _outside(vertices: np.ndarray, u: np.ndarray, v: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:

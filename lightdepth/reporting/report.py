@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import html
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files as package_files
 from pathlib import Path
@@ -22,13 +23,27 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-
 """What a browser is told to refuse: all that does not stand in the page."""
 
 _VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
-_JPEG = b"\xff\xd8"
+_KINDS = {b"\xff\xd8": "jpeg", b"RIFF": "webp"}
+"""Pictures by how they begin; others are PNG."""
+_SHORT = 14
+"""Characters of a cell that stay in one line."""
+SMALL = 110
+"""Width of a tile of many, pixels of the page: three beside each other on a phone."""
 _OF_EVERY_RUN = [
     ("config.yaml", "the settings of this run"),
     ("log.txt", "what it said"),
     ("run.json", "what was done, with figures, versions and warnings"),
 ]
 _OPENERS = "MeshLab, CloudCompare and Blender"
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A picture (PNG, JPEG or WebP) among others, what is written below it, and the RGB colour of its frame."""
+
+    picture: bytes
+    label: str
+    color: tuple[int, int, int] | None = None
 
 
 class Report:
@@ -48,12 +63,12 @@ class Report:
     def table(self, headers: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Numbers are shown with three significant digits; give strings where that is not wanted."""
         of_words = [bool(rows) and isinstance(rows[0][i], str) for i in range(len(headers))]
-        head = "".join(map(_header, headers, of_words))
+        head = f"<thead><tr>{''.join(map(_header, headers, of_words))}</tr></thead>" if any(headers) else ""
         body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
         name = f"Table: {_shown(self._heading)}"  # one that is wider than a phone is scrolled in a box, by keys too
         self._parts.append(
             f'<div class="table" role="group" tabindex="0" aria-label="{name}">'
-            f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+            f"<table>{head}<tbody>{body}</tbody></table></div>"
         )
 
     def files(self, folder: Path, what: Mapping[str, str], of_a_run: bool = True) -> None:
@@ -86,12 +101,22 @@ class Report:
         self._drawn = True
 
     def figures(self, pictures: Sequence[tuple[bytes, str]]) -> None:
-        """Pictures (PNG or JPEG) with captions, beside each other where there is room."""
+        """Pictures (PNG, JPEG or WebP) with captions, beside each other where there is room."""
         self._parts.append('<div class="figures">' + "".join(_figure(*p) for p in pictures) + "</div>")
 
     def wide_figures(self, pictures: Sequence[tuple[bytes, str]]) -> None:
-        """Pictures (PNG or JPEG) with captions, one below the other."""
+        """Pictures (PNG, JPEG or WebP) with captions, one below the other."""
         self._parts += [_figure(*p) for p in pictures]
+
+    def tiles(self, tiles: Sequence[Tile], caption: str, width: int = 300) -> None:
+        """Small pictures in rows, as many in one as there is room for at some `width` each, in pixels of the page, and
+        one caption for all. Words stand below them, and not in them: on a phone they are as large as elsewhere."""
+        made = "".join(f"<figure{_edge(t.color)}>{_image(t.picture, f'{t.label}, {self._heading}')}"
+                       f"<figcaption>{_shown(t.label)}</figcaption></figure>" for t in tiles)  # fmt: skip
+        self._parts.append(
+            f'<figure class="tiles" style="--wide: {width}px"><div>{made}</div>'
+            f"<figcaption>{_shown(caption)}</figcaption></figure>"
+        )
 
     def write(self, path: Path) -> None:
         head = (
@@ -127,11 +152,17 @@ def _shown(text: str) -> str:
 
 
 def _figure(data: bytes, caption: str) -> str:
-    source, kind = base64.b64encode(data).decode(), "jpeg" if data.startswith(_JPEG) else "png"
-    text = _shown(caption)
+    return f"<figure>{_image(data, caption)}<figcaption>{_shown(caption)}</figcaption></figure>"
+
+
+def _image(data: bytes, words: str) -> str:
+    kind = next((kind for begin, kind in _KINDS.items() if data.startswith(begin)), "png")
     drawn = ' class="chart"' if isinstance(data, Chart) else ""
-    image = f'<img{drawn} alt="{text}" src="data:image/{kind};base64,{source}">'
-    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
+    return f'<img{drawn} alt="{_shown(words)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
+
+
+def _edge(color: tuple[int, int, int] | None) -> str:
+    return "" if color is None else f' style="--edge: rgb({", ".join(map(str, color))})"'
 
 
 def _header(text: str, of_words: bool) -> str:
@@ -141,7 +172,8 @@ def _header(text: str, of_words: bool) -> str:
 
 def _cell(value: Any) -> str:
     if isinstance(value, str):
-        return f'<td class="text">{_shown(value)}</td>'
+        kind = "text short" if len(value) <= _SHORT else "text"
+        return f'<td class="{kind}">{_shown(value)}</td>'
     return f"<td>{number(value)}</td>"
 
 

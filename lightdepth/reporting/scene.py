@@ -10,16 +10,20 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from lightdepth import native
 from lightdepth.foreign_text import for_terminal
+from lightdepth.reporting.figures import MeshView, webp
 
 _STEPS = 65535  # of a place along an axis, from one end of the surface to the other
+_TOGETHER = 250_000  # triangles of all surfaces
+_FEWEST = 4_000  # of each, however many there are
 _ROUGHLY = 10  # times the triangles that are wanted: a larger mesh is thinned out quickly first
 
 
@@ -94,22 +98,41 @@ class Surface:
 
 @dataclass(frozen=True)
 class Picture:
-    """What is shown of a keyframe, as JPEG."""
+    """What is shown of a keyframe, as JPEG; None for what there is not."""
 
     image: bytes
-    depth: bytes | None = None
+    distance: bytes | None = None
+    uncertainty: bytes | None = None
+    residual: bytes | None = None
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Surfaces, of which one at a time is shown, and pictures of keyframes by name. `still` (PNG or JPEG) is shown
-    where a browser cannot draw; `most` is the number of triangles that are drawn of each surface."""
+    """Surfaces, of which one at a time is shown, and pictures of keyframes by name. `still` (PNG, JPEG or WebP) is
+    shown where a browser cannot draw; `most` is the number of triangles that are drawn of each surface."""
 
     surfaces: tuple[Surface, ...]
     still: bytes
     pictures: Mapping[str, Picture] = field(default_factory=dict)
+    kinds: Mapping[str, str] = field(default_factory=dict)
+    """What the pictures beside the image show, in words, by the names of their fields."""
     most: int = 50_000
     most_points: int = 20_000
+
+    @classmethod
+    def of(
+        cls,
+        surfaces: Sequence[Surface],
+        pictures: Mapping[str, Picture] = MappingProxyType({}),
+        kinds: Mapping[str, str] = MappingProxyType({}),
+    ) -> Scene | None:
+        """Of the surfaces that have a triangle, the first of them in a still picture too; None where there is none.
+        Many are shown with fewer triangles each."""
+        shown = tuple(surface for surface in surfaces if len(surface.triangles))
+        if not shown:
+            return None
+        still = MeshView.of(shown[0].vertices, shown[0].triangles).cutout(shown[0].layers[0].colors())
+        return cls(shown, webp(still), pictures, kinds, max(min(cls.most, _TOGETHER // len(shown)), _FEWEST))
 
     def text(self) -> str:
         """The JSON, which ends no element of HTML that it stands in."""
@@ -117,11 +140,12 @@ class Scene:
         told = {
             "surfaces": [_surface(surface, self.most, self.most_points) for surface in self.surfaces],
             "pictures": [
-                {"name": for_terminal(name), "image": packed(np.frombuffer(p.image, np.uint8))}
-                | ({} if p.depth is None else {"depth": packed(np.frombuffer(p.depth, np.uint8))})
+                {"name": for_terminal(name)}
+                | {kind: packed(np.frombuffer(data, np.uint8)) for kind, data in vars(p).items() if data is not None}
                 for name, p in self.pictures.items()
                 if name in used
             ],
+            "kinds": dict(self.kinds),
         }
         return json.dumps(told, separators=(",", ":")).replace("<", r"\u003c")
 
@@ -181,6 +205,12 @@ def _places(points: np.ndarray) -> dict[str, Any]:
     step = np.maximum(np.ptp(points, axis=0) / _STEPS if len(points) else np.zeros(3), np.finfo(np.float32).tiny)
     numbers = np.rint((points - low) / step)
     return {"low": low.tolist(), "step": step.tolist(), **packed(numbers, np.uint16)}
+
+
+def bytes_of(shares: np.ndarray) -> np.ndarray:
+    """Shares in [0, 1] as uint8."""
+    found: np.ndarray = np.rint(255 * np.clip(shares, 0, 1)).astype(np.uint8)
+    return found
 
 
 def _rounded(values: np.ndarray) -> list[Any]:

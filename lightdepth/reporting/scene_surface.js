@@ -161,6 +161,7 @@ class Shown {
     const vertices = places(told.vertices, this.middle), triangles = numbers(told.triangles);
     this.count = triangles.length;
     this.kind = told.triangles.uint16 === undefined ? gl.UNSIGNED_INT : gl.UNSIGNED_SHORT;
+    this.places = vertices;
     this.vertices = buffer(gl, gl.ARRAY_BUFFER, vertices);
     this.normals = buffer(gl, gl.ARRAY_BUFFER, normals(vertices, triangles));
     this.triangles = buffer(gl, gl.ELEMENT_ARRAY_BUFFER, triangles);

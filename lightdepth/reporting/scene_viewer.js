@@ -4,7 +4,7 @@
  */
 
 const USED = [0.16, 0.5, 0.85], LEFT_OUT = [0.6, 0.6, 0.6], CHOSEN = [1.0, 0.62, 0.1], PATH = [0.16, 0.5, 0.85];
-const OUTSIDE = 0.36; /* the least of Viewer.tangent */
+const OUTSIDE = 0.36; /* tangent of half of what is seen from outside, downwards */
 
 /* Elements of the page. */
 
@@ -61,7 +61,7 @@ class Viewer {
       element("label", {}, "Keyframe ", this.keyframe));
     this.root.append(
       element("p", { className: "scene-how", textContent: "Drag to turn, wheel or two fingers to come nearer, Shift and " +
-        "drag to move; a click on a camera shows its picture." }),
+        `drag to move${this.told.surfaces.some((s) => s.poses.length) ? "; a click on a camera shows its picture" : ""}.` }),
       element("div", { className: "scene-view" }, this.canvas, this.picture),
       this.legend,
       element("div", { className: "scene-controls" }, which, this.layers, this.shown, this.path),
@@ -79,9 +79,11 @@ class Viewer {
       return label;
     }));
     const kinds = ["Surface", "Look through the near wall", "Cameras", "Path", ...told.clouds.map((c) => c.title)];
-    this.visible = kinds.map((title) => title === "Surface" || title === "Cameras" || title === "Path");
+    const shown = poses.length ? ["Surface", "Cameras", "Path"] : ["Surface"];
+    this.visible = kinds.map((title) => shown.includes(title));
     this.shown.replaceChildren(this.shown.firstChild, ...kinds.map((title, i) => {
       const [input, label] = choice(title, { type: "checkbox", checked: this.visible[i] });
+      label.hidden = !poses.length && ["Cameras", "Path"].includes(title);
       input.addEventListener("change", () => { this.visible[i] = input.checked; this.redraw(); });
       if (i < 4) return label;
       const swatch = element("span", { className: "scene-swatch" });
@@ -106,11 +108,27 @@ class Viewer {
 
   reset() {
     this.axes = rows(this.now.told.axes);
-    this.target = [0, 0, 0];
-    this.distance = 1.1 * this.now.extent;
+    [this.target, this.distance] = this.whole();
     this.inside = null;
     this.back.disabled = true;
     this.redraw();
+  }
+
+  /* From where the whole surface and its cameras are in sight: the place looked at, and the distance from it. */
+  whole() {
+    const { places, poses, extent } = this.now, centers = poses.map((pose) => pose.center);
+    const near = centers.filter((center) => Math.hypot(...center) < extent), low = [], high = [];
+    const seen = (place) => this.axes.forEach((axis, k) => {
+      const far = dot(axis, place);
+      low[k] = Math.min(low[k] ?? far, far);
+      high[k] = Math.max(high[k] ?? far, far);
+    });
+    for (let i = 0; i < places.length; i += 3) seen(places.subarray(i, i + 3));
+    near.forEach(seen);
+    const half = minus(high, low).map((side) => side / 2), tangent = OUTSIDE;
+    const aspect = this.canvas.clientWidth / Math.max(this.canvas.clientHeight, 1) || 1;
+    const middle = this.axes.reduce((sum, axis, k) => along(sum, (low[k] + high[k]) / 2, axis), [0, 0, 0]);
+    return [middle, half[2] + 1.06 * Math.max(half[0] / (tangent * aspect), half[1] / tangent, 1e-6 * extent)];
   }
 
   enter(place) {
@@ -153,28 +171,25 @@ class Viewer {
     this.picture.hidden = !pose;
     if (pose) {
       const found = this.pictures.get(pose.name), inside = [];
-      for (const [key, words] of [["image", "Image"], ["depth", "Predicted distance, yellow near,"]]) {
+      const said = [];
+      for (const [key, words] of [["image", "image"], ...Object.entries(this.told.kinds)]) {
         if (!found || !found[key]) continue;
         const data = found[key].uint8.replace(/-/g, "+").replace(/_/g, "/");
-        inside.push(element("img", { alt: `${words} of keyframe ${pose.name}`, src: `data:image/jpeg;base64,${data}` }));
+        inside.push(element("img", { alt: `Keyframe ${pose.name}: ${words}`, src: `data:image/jpeg;base64,${data}` }));
+        said.push(words);
       }
       const state = pose.used ? "" : ", left out of the surface";
-      const words = found ? "image, and predicted distance (yellow near)" : "no picture of it is kept on this page";
+      const words = said.join("; ") || "no picture of it is kept on this page";
       this.picture.replaceChildren(...inside, element("figcaption", { textContent: `${pose.name}${state}: ${words}` }));
     }
     this.redraw();
-  }
-
-  /* Of half of what is seen from outside, downwards: a narrow canvas shows the whole width of the surface too. */
-  tangent() {
-    return Math.max(OUTSIDE, (0.53 * this.canvas.clientHeight) / Math.max(this.canvas.clientWidth, 1));
   }
 
   camera() {
     const aspect = this.canvas.width / this.canvas.height;
     if (this.inside === null) {
       const eye = along(this.target, -this.distance, this.axes[2]);
-      const reach = Math.hypot(...eye) + 2 * this.now.extent, tangent = this.tangent();
+      const reach = Math.hypot(...eye) + 2 * this.now.extent, tangent = OUTSIDE;
       return { axes: this.axes, eye, aspect, tangent, near: Math.max(0.005 * this.distance, 1e-4 * reach), far: reach };
     }
     const { axes, eye } = this.now.riding(this.inside), [x, y] = this.now.told.tangents;
@@ -274,7 +289,7 @@ class Viewer {
 
   move(dx, dy) {
     if (this.inside !== null) return;
-    const pixel = (2 * this.distance * this.tangent()) / Math.max(this.canvas.clientHeight, 1);
+    const pixel = (2 * this.distance * OUTSIDE) / Math.max(this.canvas.clientHeight, 1);
     this.target = along(along(this.target, -pixel * dx, this.axes[0]), -pixel * dy, this.axes[1]);
     this.redraw();
   }

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from lightdepth.frame import Frame, readable
 from lightdepth.models import DeclineModel, DepthModel, NetworkModel
 from lightdepth.prediction import DepthPrediction
-from lightdepth.reporting.figures import colored_distance, jpeg, side_by_side, thumbnail
-from lightdepth.reporting.report import Report
+from lightdepth.reporting.figures import colored_distance, jpeg, thumbnail
+from lightdepth.reporting.report import Report, Tile
 
 from .judging import Outcome
 from .module import Adaptation
@@ -38,19 +38,19 @@ class Pictures:
         for frame, row in zip(self._frames, self._said, strict=True):
             row.append(model(frame))
 
-    def rows(self) -> list[tuple[bytes, str]]:
-        """PNG and caption for each frame: closed form, start and adapted network."""
+    def rows(self) -> list[tuple[list[Tile], str]]:
+        """Pictures and caption for each frame: closed form, start and adapted network."""
         return [_picture(frame, row) for frame, row in zip(self._frames, self._said, strict=True)]
 
 
-def _picture(frame: Frame, predictions: Sequence[DepthPrediction]) -> tuple[bytes, str]:
+def _picture(frame: Frame, predictions: Sequence[DepthPrediction]) -> tuple[list[Tile], str]:
     maps = [(p.distance, p.valid) for p in predictions]
-    names = "image, closed form, start, adapted"
+    names = ["image", "closed form", "start", "adapted"]
     if frame.true_distance is not None:
         maps.append((frame.true_distance, frame.valid & (frame.true_distance > 0)))
-        names += ", truth"
-    pictures = [thumbnail(picture, 240) for picture in (frame.image, *(colored_distance(*m) for m in maps))]
-    return jpeg(side_by_side(pictures)), f"{frame.name}: {names}"
+        names.append("truth")
+    pictures = [frame.image, *(colored_distance(*m) for m in maps)]
+    return [Tile(jpeg(thumbnail(p, 240)), n) for p, n in zip(pictures, names, strict=True)], frame.name
 
 
 def page(

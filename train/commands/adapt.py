@@ -132,7 +132,8 @@ def adapt(
             (run.folder / "model.md").write_text(card.text(output.name), encoding="utf-8", errors="backslashreplace")
         light = run.record.get("light_fit")
         made = page(target, start, module, outcome, data.counts["val"], light["summary"] if light else None)
-        made.wide_figures(pictures.rows())
+        for tiles, caption in pictures.rows():
+            made.tiles(tiles, caption, 180)
         made.files(run.folder, FILES)
         made.write(run.folder / "report.html")
         _record(run, start, target, module, data, config, outcome)

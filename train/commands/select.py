@@ -32,10 +32,10 @@ from lightdepth.maps.convention import MapReading
 from lightdepth.ranges import Range, checked
 from lightdepth.reporting import batches
 from lightdepth.reporting.beside import goes_on, kept_beside
-from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, png, thumbnail
+from lightdepth.reporting.figures import BAD, GOOD, contact_sheet, jpeg, png, thumbnail
 from lightdepth.reporting.names import told
 from lightdepth.reporting.progress import Progress
-from lightdepth.reporting.report import Report
+from lightdepth.reporting.report import SMALL, Report, Tile
 from lightdepth.reporting.run import Run, recorded
 from lightdepth.sparse_map import SparseMap
 
@@ -162,17 +162,17 @@ def select(
         chosen = [f"{folder}{v.name}" for v in verdicts if v.kept]
         listed = [_comment(line) for line in (f"{shown}: {summary}", *header, _ending(made_by, len(chosen)))]
         listed += chosen
-        picture = None if no_frames else _sheet(frames, verdicts)
+        pictures = [] if no_frames else _pictures(frames, verdicts)
         doubts = tuple(told(doubt, data=data, map=map) for doubt in doubts)
-        page = _page(f"{shown}, {header[0]}: {summary}.", header[1:], verdicts, picture, doubts)
+        page = _page(f"{shown}, {header[0]}: {summary}.", header[1:], verdicts, pictures, doubts)
         page.links([(paths[what].name, said) for what, said in _FILES.items() if what != "sheet" or not no_frames])
         writers: dict[Path, Content] = {
             paths["table"]: _table(verdicts),
             paths["page"]: page.write,
             paths["list"]: "\n".join(listed) + "\n",  # last: its presence means all is there
         }
-        if picture is not None:
-            writers = {paths["sheet"]: picture, **writers}
+        if pictures:
+            writers = {paths["sheet"]: _sheet(pictures), **writers}
         check_files(writers, replacing)  # a run to list.md writes list.csv too
         write_together(writers)
         if no_frames:
@@ -305,23 +305,34 @@ def _table(verdicts: Sequence[FrameVerdict]) -> str:
     return buffer.getvalue()
 
 
-def _sheet(frames: FrameSequence, verdicts: Sequence[FrameVerdict]) -> bytes:
+def _pictures(frames: FrameSequence, verdicts: Sequence[FrameVerdict]) -> list[tuple[np.ndarray, FrameVerdict]]:
     """Kept and rejected frames in order, spread over the sequence. Read again: keeping them would fill the memory."""
     rows = []
     for kept in (True, False):
         readable = [i for i, v in enumerate(verdicts) if v.kept == kept and v.reason != "unreadable"]
         rows += [readable[i] for i in np.linspace(0, len(readable) - 1, min(_SHOWN, len(readable))).astype(int)]
     rows.sort()
-    pictures = [thumbnail(frames[i].image, 160) for i in rows]
-    labels = [f"{verdicts[i].name[-14:]} {verdicts[i].reason}"[:28] for i in rows]
-    return png(contact_sheet(pictures, labels, [GOOD if verdicts[i].kept else BAD for i in rows]))
+    return [(thumbnail(frames[i].image, 160), verdicts[i]) for i in rows]
+
+
+def _sheet(pictures: Sequence[tuple[np.ndarray, FrameVerdict]]) -> bytes:
+    labels = [f"{verdict.name[-14:]} {verdict.reason}"[:28] for _, verdict in pictures]
+    return png(contact_sheet([p for p, _ in pictures], labels, [_color(verdict) for _, verdict in pictures]))
+
+
+def _tile(picture: np.ndarray, verdict: FrameVerdict) -> Tile:
+    return Tile(jpeg(picture), f"{verdict.name} {verdict.reason}".strip(), _color(verdict))
+
+
+def _color(verdict: FrameVerdict) -> tuple[int, int, int]:
+    return GOOD if verdict.kept else BAD
 
 
 def _page(
     said: str,
     settings: Sequence[str],
     verdicts: Sequence[FrameVerdict],
-    picture: bytes | None,
+    pictures: Sequence[tuple[np.ndarray, FrameVerdict]],
     doubts: Sequence[str],
 ) -> Report:
     page = Report("Frames worth training on")
@@ -332,9 +343,10 @@ def _page(
     page.table(["", "frames", "share"], [[what, n, n / len(verdicts)] for what, n in counts.most_common()])
     if any(v.reason == "blur" for v in verdicts):
         page.text("Blur stands for all that shows little detail: blur, water, cover, and walls too near.")
-    if picture is not None:
+    if pictures:
         page.heading("Kept (green) and rejected (red)")
-        page.wide_figures([(picture, f"At most {_SHOWN} of each, spread over the sequence, in its order")])
+        said = f"At most {_SHOWN} of each, spread over the sequence, in its order"
+        page.tiles([_tile(*picture) for picture in pictures], said, SMALL)
     page.heading("Settings")
     page.table(["", "value"], [line.split(": ", 1) for line in settings])
     return page

@@ -56,7 +56,7 @@ def train(argv: list[str] | None = None) -> int:
     if first_process():
         outcome().made(output)
         then = f"lightdepth densify DATA --map MAP --checkpoint {quote(str(output / 'model.safetensors'))} -o runs/own"
-        end(output, then=then, page=output / "model.md")
+        end(output, then=then, page=output / "report.html")
     return 0
 
 

@@ -19,19 +19,19 @@ from lightdepth.reporting.figures import (
     GOOD,
     chart_png,
     colored_distance,
-    contact_sheet,
+    jpeg,
     marked_points,
-    png,
+    signed_colors,
     thumbnail,
 )
-from lightdepth.reporting.report import Report
+from lightdepth.reporting.report import Report, Tile
 
 _WORST = 0.25
 """Relative error that is drawn in full red (too far) or full blue (too near)."""
 _COLORS = ["#888888", "#444444", "#e0a030", "#c03030", "#60a0d8", "#1060b0", "#108040", "#a040a0", "#60c0a0"]
 
 
-def keyframe_picture(judged: Judged) -> bytes:
+def keyframe_pictures(judged: Judged) -> list[Tile]:
     """Of a cell's middle keyframe: the image with its points (green in, red out), true depth, and the errors of some
     ways, red where the wall is put too far, blue where too near."""
     task = judged.task
@@ -51,16 +51,8 @@ def keyframe_picture(judged: Judged) -> bytes:
         if prediction is not None:
             depth = depth_from_distance(prediction.distance, frame.camera.rays()[0][..., 2])
             ratio = judged.mm_per_unit * depth / np.where(known, truth, 1)
-            shown[title] = thumbnail(_signed(ratio - 1, known & prediction.valid), 320)
-    return png(contact_sheet(list(shown.values()), list(shown), columns=len(shown), width=240))
-
-
-def _signed(error: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Relative errors (H, W) as colours (H, W, 3) uint8: white right, red too far, blue too near, grey unknown."""
-    level = np.clip(error / _WORST, -1, 1)[..., None]
-    red, blue = np.array([200, 20, 20]), np.array([20, 60, 200])
-    colors = np.where(level > 0, 255 + level * (red - 255.0), 255 - level * (blue - 255.0))
-    return np.where(known[..., None], colors, 120).astype(np.uint8)
+            shown[title] = thumbnail(signed_colors((ratio - 1) / _WORST, known & prediction.valid), 320)
+    return [Tile(jpeg(picture), title) for title, picture in shown.items()]
 
 
 def band_picture(cells: Sequence[CellFigures]) -> bytes:
@@ -114,7 +106,7 @@ def front_picture(cells: Sequence[CellFigures]) -> bytes:
     return chart_png(figure)
 
 
-def page(cells: Sequence[CellFigures], pictures: Sequence[tuple[bytes, str]]) -> Report:
+def page(cells: Sequence[CellFigures], pictures: Sequence[tuple[Sequence[Tile], str]]) -> Report:
     """The whole page; `pictures` are keyframes with captions."""
     report = Report("Completion from sparse points")
     for note in notes(cells):
@@ -133,5 +125,6 @@ def page(cells: Sequence[CellFigures], pictures: Sequence[tuple[bytes, str]]) ->
     )
     report.wide_figures([(front_picture(cells), caption)])
     report.heading("A keyframe of each colon")
-    report.wide_figures(pictures)
+    for tiles, caption in pictures:
+        report.tiles(tiles, caption, 220)
     return report
