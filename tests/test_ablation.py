@@ -345,7 +345,7 @@ def test_a_wrong_and_a_random_reflectance_reach_what_is_trained_on(cheap):
             FrameData(tube=TubeData(scenes=7, val_scenes=1, frames=1), size=(40, 32), augment=False, **options)
         )
         data.setup()
-        data.trainer = type("T", (), {"training": training, "global_step": 5, "global_rank": 0})()
+        data.trainer = type("T", (), {"training": training, "global_step": 5, "global_rank": 0, "world_size": 1})()
         batches = data.val_dataloader() if not training else data.train_dataloader()
         return [float(v) for b in batches for v in data.on_after_batch_transfer(b, 0).light.reflectance.flatten()]
 

@@ -11,12 +11,12 @@ from densify.agreement import (
     View,
     _deviation,
     _overlap_rows,
-    _pairs,
     _Places,
     _point_rows,
     _Rows,
     _step,
     agree,
+    compared_pairs,
     gap_between,
     inlier_deviation,
 )
@@ -28,9 +28,9 @@ from lightdepth.prediction import DepthPrediction
 
 def test_each_view_is_compared_with_those_that_share_most_points_in_both_directions():
     shared = np.array([[9, 5, 3, 0], [5, 9, 1, 2], [3, 1, 9, 0], [0, 2, 0, 9]])
-    assert _pairs(shared, 1) == [(0, 1), (0, 2), (1, 0), (1, 3), (2, 0), (3, 1)]
-    assert _pairs(shared, 0) == [] and _pairs(np.diag([9, 9]), 4) == []
-    every = _pairs(shared, 4)
+    assert compared_pairs(shared, 1) == [(0, 1), (0, 2), (1, 0), (1, 3), (2, 0), (3, 1)]
+    assert compared_pairs(shared, 0) == [] and compared_pairs(np.diag([9, 9]), 4) == []
+    every = compared_pairs(shared, 4)
     assert set(every) == {(i, j) for i in range(4) for j in range(4) if i != j and shared[i, j]}
 
 

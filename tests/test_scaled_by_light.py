@@ -61,7 +61,7 @@ def test_where_one_map_is_refused_all_surfaces_stay_in_map_units(tmp_path, monke
 )
 def test_a_run_at_work_is_viewed_in_the_unit_that_its_surfaces_have(tmp_path, asked, beside, unit):
     pytest.importorskip("viser")
-    from densify.viewing.work import _unit_meant
+    from densify.viewing.known import _unit_meant
 
     if beside is not None:
         Scales((MapScale(0, 2.0, (1.0, 4.0)),)).write_file(tmp_path, beside, PhotometricCalibration())

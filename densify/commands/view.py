@@ -57,6 +57,8 @@ def view(
 
 def _record(run: Path, data: Path | None, mm_per_unit: float | None, triangles: int, output: Path) -> None:
     """Writes a recording of the maps that there are now."""
+    if output.suffix != ".rrd":
+        raise InputError("--rerun", f"{output} does not end in .rrd", "the Rerun viewer opens no other files")
     try:
         from densify.viewing.recording import BEGINNING, write_recording
     except ModuleNotFoundError as error:
@@ -64,8 +66,6 @@ def _record(run: Path, data: Path | None, mm_per_unit: float | None, triangles: 
     from densify.viewing.known import known_of
     from densify.viewing.watched import WatchedRun
 
-    if output.suffix != ".rrd":
-        raise InputError("--rerun", f"{output} does not end in .rrd", "the Rerun viewer opens no other files")
     check_rewritable(output, BEGINNING, [run, data])
     watched = WatchedRun(run, triangles)
     if not (maps := watched.first()):
