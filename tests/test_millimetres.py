@@ -161,7 +161,7 @@ def test_what_a_board_says_of_the_lens_s_share_of_mu_is_taken_and_the_interval_i
     assert abs(np.log(known.mm_per_unit / 2)) < abs(np.log(none_of_it.mm_per_unit / 2))
 
 
-def test_each_of_several_lamps_lights_from_its_own_place(looks):
+def test_each_of_several_lamps_lights_from_its_own_place():
     sides = ((4.0, 1.5, 0.0), (-4.0, 1.5, 0.0))
     lamps = MeasuredLamps(sides, (0.25, 0.75), (0.1, 0.1, 0.1))
     light = replace(LIGHT, position_mm=(-2.0, 1.5, 0.0), lamps=lamps)
@@ -169,9 +169,6 @@ def test_each_of_several_lamps_lights_from_its_own_place(looks):
     both = _lit(at, turned, np.eye(4), light, 2.0, 0.0)
     each = [_lit(at, turned, np.eye(4), replace(LIGHT, position_mm=place), 2.0, 0.0) for place in sides]
     np.testing.assert_allclose(both, 0.25 * each[0] + 0.75 * each[1])
-    # Lamps of the light's mean place are no such pair: the images put them elsewhere, or tell another scale.
-    alone = millimetres(looks, light, near=2.5)
-    assert alone.refused or abs(np.log(alone.mm_per_unit / 2)) > 0.1
 
 
 def test_an_offset_too_small_to_be_seen_tells_nothing():
