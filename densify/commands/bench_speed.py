@@ -62,9 +62,9 @@ def measure_speed(
         shown = ", ".join(f"{width}x{height}" for width, height in image_sizes)
         whole = counted(len(colons_of(image_sizes, keyframes)), "whole run")
         what = f"stages of densify at {shown}, and {whole}, would be timed"
-        taken = count * (seconds + _PART * slowness())
-        run.begins(what, lambda: [Step(f"timing {counted(count, 'part')}", taken)])
         slow = slowness()
+        taken = count * (seconds + _PART * slow)
+        run.begins(what, lambda: [Step(f"timing {counted(count, 'part')}", taken)])
         machines = machines_of(model.device if isinstance(model, NetworkModel) else torch.device("cpu"))
         with TemporaryDirectory() as made, Progress("Speed", count) as bar:
             found = measured(image_sizes, keyframes, model, predicting, machines, seconds, Path(made), bar.advance)
