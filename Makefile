@@ -37,7 +37,7 @@ fuzz: setup
 
 # Machine code counts no lines, so the tests of the compiled loops run once more with Numba off; all tests would take
 # hours so. The floor stands in pyproject.toml.
-LOOPS := $(patsubst %,tests/test_%.py,compiled coverage fusion marching marching_cubes rectify second_core)
+LOOPS := $(patsubst %,tests/test_%.py,compiled coverage fusion marching marching_cubes patch_ncc rectify second_core)
 coverage: setup
 	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --cov --cov-report= --cov-fail-under=0
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n auto --maxprocesses 8 --cov --cov-append \

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from densify.fusion.compiled import cache_folder, open_to_others
 from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth import native
 from lightdepth.camera import Pinhole
+from lightdepth.compiled import cache_folder, open_to_others
 from lightdepth.errors import InputError
 from lightdepth.files.lock import locked
 from lightdepth.files.replacing import hidden, output_of, recover, remains

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from importlib.abc import Loader, MetaPathFinder
 
 MOVED: dict[str, str] = {
-    "densify.compiled": "densify.fusion.compiled",
+    "densify.compiled": "lightdepth.compiled",
+    "densify.fusion.compiled": "lightdepth.compiled",
     "densify.judge": "densify.evaluation.judge",
     "densify.marching": "densify.fusion.patches",
     "densify.marching_cubes": "densify.fusion.marching_cubes",

@@ -29,6 +29,7 @@ from lightdepth.camera import CameraModel
 from lightdepth.errors import InputError
 from lightdepth.frame import Frame, brightest
 from lightdepth.observations import ObservedDistances, sample_distance
+from lightdepth.patch_ncc import ncc
 from lightdepth.prediction import DepthPrediction
 from lightdepth.ranges import Range, above, at_least, checked
 from lightdepth.sparse_map import Keyframe, Submap
@@ -212,17 +213,10 @@ class _Sweep:
     known: np.ndarray
     own: np.ndarray
     places: np.ndarray
-    grid: np.ndarray
 
     @property
     def shape(self) -> tuple[int, int]:
         return len(self.guess), len(HYPOTHESES)
-
-    @property
-    def corners(self) -> list[int]:
-        """Of the grid: what they see within an image, all of a patch does."""
-        across = round(len(self.grid) ** 0.5)
-        return [0, across - 1, len(self.grid) - across, len(self.grid) - 1]
 
     @classmethod
     def of(cls, look: Look, pixels: np.ndarray, guess: np.ndarray, patch: int) -> _Sweep:
@@ -237,7 +231,7 @@ class _Sweep:
         grid = np.stack(np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1)), -1).reshape(-1, 2)
         own = _sampled(look.brightness, pixels[:, None] + grid)
         own -= own.mean(1, keepdims=True)
-        return cls(np.log(distance[:, 0]), known, own, places, grid.astype(np.float32))
+        return cls(np.log(distance[:, 0]), known, own, places)
 
     def compared(self, look: Look, other: Look) -> tuple[np.ndarray, np.ndarray]:
         """NCC (n, k) of every hypothesis with what another keyframe shows, 0 where it does not see it, and whether it
@@ -245,21 +239,8 @@ class _Sweep:
         other_from_this = other.keyframe.cam_from_map @ np.linalg.inv(look.keyframe.cam_from_map)
         moved = self.places.reshape(-1, 3) @ other_from_this[:3, :3].T + other_from_this[:3, 3]
         projected, seen = other.keyframe.camera.project(moved)
-        projected = np.where(seen[:, None], projected, -1e3).reshape(*self.shape, 3, 2)
-        middle = projected[:, :, 0]
-        beside = (projected[:, :, 1:] - middle[:, :, None]) / _BESIDE
-        at = (middle[:, :, None] - 0.5).astype(np.float32) + self.grid @ beside.astype(np.float32)
-        height, width = other.usable.shape
-        ends = at[:, :, self.corners]
-        inside = seen.reshape(*self.shape, 3).all(2) & ((ends >= 0) & (ends <= (width - 1, height - 1))).all((2, 3))
-        cell = np.clip(middle.astype(int), 0, (width - 1, height - 1))
-        inside &= other.usable[cell[..., 1], cell[..., 0]]
-        places = at.reshape(self.shape[0], -1, 2)
-        values = cv2.remap(other.brightness, places[..., 0], places[..., 1], cv2.INTER_LINEAR).reshape(at.shape[:3])
-        values -= values.mean(2, keepdims=True)
-        size = np.sqrt((values**2).sum(2)) * np.sqrt((self.own**2).sum(1))[:, None]
-        score = np.einsum("nkq,nq->nk", values, self.own) / np.maximum(size, 1e-9)
-        return np.where(inside, score, 0.0), inside
+        known = seen.reshape(*self.shape, 3).all(2) & self.known[:, None]
+        return ncc(other.brightness, other.usable, projected.reshape(*self.shape, 3, 2), known, self.own, _BESIDE)
 
 
 def _sampled(image: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from raising import warned
 
-from densify.fusion import compiled as module
-from densify.fusion.compiled import cache_folder, compiled, open_to_others
+from lightdepth import compiled as module
+from lightdepth.compiled import cache_folder, compiled, open_to_others
 
 
 def twice(values):

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from densify.fusion.compiled import compiled
+from lightdepth.compiled import compiled
 
 BLOCK = 8
 """Voxels along the side of a block. Compiled code relies on it."""

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from densify.fusion.compiled import compiled
 from densify.fusion.marching_cubes import one_vertex_an_edge
 from densify.fusion.volume import TsdfVolume
+from lightdepth.compiled import compiled
 
 
 class Patch(NamedTuple):

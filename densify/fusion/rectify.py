@@ -17,9 +17,9 @@ from typing import Annotated, Literal
 import cv2
 import numpy as np
 
-from densify.fusion.compiled import compiled
 from densify.fusion.second_core import halves
 from lightdepth.camera import CameraModel, Pinhole
+from lightdepth.compiled import compiled
 from lightdepth.errors import InputError
 from lightdepth.frame import brightest
 from lightdepth.prediction import DepthPrediction

@@ -16,10 +16,10 @@ from typing import Annotated
 
 import numpy as np
 
-from densify.fusion.compiled import compiled
 from densify.fusion.marching_cubes import BLOCK, CORNERS, REACH, Cut, cut, one_vertex_an_edge, packed
 from densify.fusion.rectify import FULL, SurfaceView
 from densify.fusion.second_core import halves
+from lightdepth.compiled import compiled
 from lightdepth.errors import InputError
 from lightdepth.ranges import COUNT, SHARE, above, checked
 from lightdepth.sparse_map import Submap, typical_distance
