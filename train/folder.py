@@ -92,7 +92,7 @@ def _check_resumable(output: Path, begun: bool, hidden: bool) -> None:
     if record is None and not begun:
         raise InputError(output, f"not resumed, its {RECORD} was not written by this program", "choose another -o")
     if record is not None and record["verb"] != "train":
-        raise InputError(output, f"not resumed, it is of {record['verb']}", "choose another -o")
+        raise InputError(output, f"not resumed, it was made by {record['verb']}", "choose another -o")
     if record is not None and not hidden and not has_checkpoint(output):
         found = "not resumed, it is complete, and its checkpoints are gone"
         raise InputError(output, found, "choose another -o, or give --overwrite to start anew")
