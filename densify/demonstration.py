@@ -85,5 +85,9 @@ def _order(verdicts: Mapping[int, Verdict | None], errors: Mapping[int, SurfaceF
     ]
     apart = [(x < y) for (a, x), (b, y) in pairs if a < b]
     if not apart:
-        return ": the colours do not tell them apart" if len(both) > 1 else ""
-    return ": the worse colour is on the worse surface" if all(apart) else ": the worse colour is on the better surface"
+        return ": the colours do not tell which is worse" if len(both) > 1 else ""
+    return (
+        ": the worse colour went to the worse surface"
+        if all(apart)
+        else ": the worse colour went to the better surface"
+    )

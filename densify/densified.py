@@ -95,7 +95,7 @@ class Densified:
         for one in found.maps:
             (run.log if one.mm_per_unit is not None else run.warn)(str(one))
         if found.told and not found.all_told:
-            run.log("surfaces stay in map units: not every map has a figure")
+            run.log("surfaces stay in map units: not every map has a scale")
         found.write_file(run.folder, "mm" if found.all_told else "map units", light)
         return found.told if found.all_told else None
 
@@ -182,7 +182,7 @@ class Densified:
             raise InputError(
                 "the maps",
                 "no keyframe of any could be aligned",
-                f"begin with the first: {'; '.join(reasons[:3]) or 'nothing was fused'}",
+                f"the first reasons: {'; '.join(reasons[:3]) or 'nothing was fused'}",
             )
         if self.verdict is not None:
             run.log(f"verdict: {self.headline}")
@@ -228,7 +228,7 @@ class Densified:
                 text += f"; {result.coverage.well_share:.0%} of the wall seen well, {counted(holes, 'hole')}"
             if dense.unsure_share is not None:
                 text += f"; {unsure(dense.unsure_share, self.config)}"
-            run.log(f"{text}; {result.seen_share:.0%} of the pixels see it")
+            run.log(f"{text}; {result.seen_share:.0%} of its keyframes' pixels show the surface")
         if self.merged is not None:
             self._write_joined(run, self.merged, formats, mm_per_unit)
         self.gallery.thumbnails.write(run.folder)
@@ -257,7 +257,7 @@ class Densified:
             run.fail(
                 "the alignment",
                 f"{aligned} of {len(alignments)} keyframes could be aligned, fewer than half: the surfaces show little "
-                f"of the map; are these its frames, its camera and its poses? (keyframe {first.keyframe}: "
+                f"of the map; do frames, camera and poses belong to it? (keyframe {first.keyframe}: "
                 f"{first.reason})",
             )
 

@@ -129,7 +129,9 @@ def _say_localised(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> No
     for submap in sparse_map.submaps:
         if any(submap.origin):
             at = ", ".join(f"{value:.0f}" for value in submap.origin)
-            run.log(f"map {submap.id} lies far from its origin: {at} is taken off its coordinates, see origin.json")
+            run.log(
+                f"map {submap.id} lies far from its origin: {at} is subtracted from its coordinates, see origin.json"
+            )
         if submap.localised is not None:
             count = len(there.intersection(submap.localised))
             told[submap.id] = {"localised": count, "frames": len(there), "keyframes": len(submap.keyframes)}
@@ -212,7 +214,7 @@ def doubts_of_inputs(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> 
     cameras = _uncertain_cameras(sparse_map)
     for known in cameras:
         run.warn_once(known.doubt)
-    run.log("colours: those of the keyframes are looked at")
+    run.log("colours: those of the keyframes are checked")
     row_of = {number: row for row, number in enumerate(frames.numbers)}
     keyframes = [row_of[k.number] for s in sparse_map.submaps for k in s.keyframes if k.number in row_of]
     colours = colours_of(frames, keyframes)

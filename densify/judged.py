@@ -206,7 +206,7 @@ def read_asked(
         raise InputError(
             "--suite",
             "without --truth, or with --trajectory, --truth-mesh or --join",
-            "it needs --truth, and goes with none of these",
+            "it needs --truth, and goes with none of the others",
         )
     if truth is None:
         return Asked(run, source, config, trajectory, reading)
@@ -256,7 +256,7 @@ def judge_asked(asked: Asked, first: DenseFirst | None, out: Run) -> Answer:
             out.fail(name, str(error))
     if asked.suite and not found:
         raise InputError(
-            "the sequences", "none could be judged", f"begin with the first: {out.record['failures'][0]['reason']}"
+            "the sequences", "none could be judged", f"the first reason: {out.record['failures'][0]['reason']}"
         )
     return Answer(found, withheld)
 

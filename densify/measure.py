@@ -126,7 +126,7 @@ def path(wall: Wall, start: np.ndarray, end: np.ndarray) -> Way:
     if not np.isfinite(distance[last]):
         raise InputError(
             "the two points",
-            "there is no way along the surface between them: they lie on parts that do not touch",
+            "no path along the surface joins them: they lie on parts that do not touch",
             f"the straight distance is {np.linalg.norm(end - start):.4g}",
         )
     chain = [last]
@@ -226,7 +226,7 @@ def chosen_map(maps: Sequence[DenseMapFiles], wanted: int | None, run: Path) -> 
     """The map of that number, or the only one. Raises InputError where there is none, or no telling which."""
     ids = [m.id for m in maps]
     if wanted is None and len(maps) > 1:
-        raise InputError(run, f"it has maps {ids}, each in a frame of its own", "say which by --map")
+        raise InputError(run, f"it has maps {ids}, each in its own frame of reference", "choose one with --map")
     found = [m for m in maps if wanted in (None, m.id)]
     if not found:
         raise InputError(run, f"no map {wanted}", f"it has {ids}")

@@ -107,7 +107,7 @@ def densify_page(
         "sparse points",
         "surface vertices",
         "voxel [map units]",
-        "pixels that see surface",
+        "share of pixels that show it",
     ]
     page.table(headers, rows)
     if any(r.coverage for r in results):
@@ -122,13 +122,13 @@ def densify_page(
 
 def joined_section(page: Report, merged: Merged) -> None:
     """Which submaps met and how, which did not and why, and the surfaces that they make together."""
-    page.heading("Submaps that meet")
+    page.heading("Joined submaps")
     rows = []
     for j in merged.tried:
         gap = j.surfaces.gap if j.surfaces else None
         state = "joined" if j.ok else f"not joined: {j.reason}"
         rows.append([f"maps {j.target} and {j.source}", j.by, f"{j.agreeing} of {j.matches}", gap, state])
-    page.table(["", "by", "correspondences that agree", "gap of the surfaces, share of the distance", ""], rows)
+    page.table(["", "by", "correspondences that agree", "gap between the surfaces, share of the distance", ""], rows)
     for result, group in zip(merged.results, merged.groups, strict=True):
         maps = ", ".join(map(str, sorted(group)))
         page.heading(f"Maps {maps} as one ({joined_name(result)})")
@@ -171,8 +171,8 @@ FILES = {
 def _errors(page: Report, figures: Sequence[MapFigures]) -> None:
     page.heading("Errors against the truth")
     page.text(
-        "Accuracy: distance from each model point to the closest true point, after the Sim(3) that aligns the "
-        "trajectories. mm."
+        "RMS and median of the distances from each model point to the closest true point, after the Sim(3) that aligns "
+        "the trajectories, and the trajectory's own error (ATE). All in mm."
     )
     rows = []
     for entry in figures:
@@ -188,18 +188,18 @@ def _errors(page: Report, figures: Sequence[MapFigures]) -> None:
         ):
             found = entry.clouds.get(key)
             if found is not None:
-                where = f"map {entry.map_id} (ATE {number(entry.aligned.rms_ate_mm)} mm)"
-                rows.append([where, name, found.points, found.rms_mm, found.median_mm])
-    page.table(["", "model", "points", "RMS", "median"], rows)
+                ate = entry.aligned.rms_ate_mm
+                rows.append([f"map {entry.map_id}", name, found.points, found.rms_mm, found.median_mm, ate])
+    page.table(["", "model", "points", "RMS", "median", "ATE"], rows)
 
 
 def _coverage(page: Report, results: Sequence[SubmapResult], mm_per_unit: MmPerUnit) -> None:
     page.heading("Coverage")
     page.text(
-        "Which part of the wall was seen well: by enough keyframes, not too slanted, neither clipped nor in the dark, "
-        "and near enough for the map to hold it: far wall is wrong in all keyframes alike, however many saw it. "
-        "Holes are wall that nothing saw, with surface around them; the open ends of a piece of tube are none. "
-        "The frame is the one to look at again."
+        "Wall was seen well if enough keyframes saw it, not too slanted and neither clipped nor in the dark, and if "
+        "the map has points near enough to hold it: depth of far wall may be wrong in all keyframes alike. "
+        "Holes are wall that no keyframe saw, with surface around them; the open ends of a piece of tube do not count. "
+        "The last column names the frame to look at again."
     )
     unit = "mm²" if mm_per_unit else "map units²"
     rows, regions = [], []
@@ -231,14 +231,14 @@ def _coverage(page: Report, results: Sequence[SubmapResult], mm_per_unit: MmPerU
 def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
     page.heading("Agreement")
     page.text(
-        "How far the distances of single keyframes are from distances that they were not fitted to, as a share, in the "
-        "median. This is agreement, not error: map and images may be wrong together with the surface, by one factor or "
-        "a slow drift of it above all. The map: points of blocks of wall, hidden from every keyframe in turn; points "
-        "drawn one by one lie beside points that were used, and flatter. As delivered: with as much of its bend as a "
-        "keyframe kept, but for its finer grid, which is what log and evaluate have. The images: distances by "
-        "parallax between keyframes. A constant distance gets the same help, one scale or a bend: what the prediction "
-        "does not win by, "
-        "the map has earned. The surface itself uses every point."
+        "Each figure is the median difference between the distances of single keyframes and distances that they were "
+        "not fitted to, as a share of the distance. This is agreement, not error: map, images and surface may be wrong "
+        "together, above all by one factor or its slow drift. Map, hidden blocks: points in blocks of wall that were "
+        "hidden from every keyframe in turn. Map, drawn points: points hidden one by one, which lie beside points that "
+        "were used, so their figures flatter. Images: distances by parallax between keyframes. As delivered: with the "
+        "part of its bend that each keyframe kept, without the finer grid; log and evaluate show these figures. A "
+        "constant distance gets the same help, one scale or a bend: where it does as well, the map did the work and "
+        "not the prediction. The surface itself uses every point."
     )
     rows: list[list[Any]] = []
     for result in results:
@@ -259,13 +259,13 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
             continue
         said = [f"{result.verdict}."] if len(results) > 1 else []  # a single one is said above
         if j.surface is not None:
-            missed = f"{100 * j.surface.miss:.0f} % of the images' rays miss the surface"
+            missed = f"{100 * j.surface.miss:.0f} % of the rays to places that the images measured miss the surface"
             few = "" if spoke(j.surface) else f" ({j.surface.points} pixels, too few to judge by)"
             said.append(f"{missed}{few}.")
         braked = [a for a in result.dense.alignments if a.unbent_because]
         if braked:
-            kept = f"{j.undone} keyframes keep one scale, {j.lessened} a part of their bend"
-            said.append(f"{kept}; {braked[0].keyframe}: {braked[0].unbent_because}.")
+            kept = f"{j.undone} keyframes lost their bend (one scale is left), {j.lessened} kept a part of it"
+            said.append(f"{kept}. Keyframe {braked[0].keyframe}: {braked[0].unbent_because}.")
         if said:
             page.text(f"Map {result.dense.submap.id}: {' '.join(said)}")
 

@@ -53,7 +53,7 @@ class LengthGiven:
             raise InputError("--length", found, "give two places by --length.ends, and their distance by --length.mm")
         if self.map is None and len(maps) > 1:
             raise InputError(
-                "--length", f"the run has maps {list(maps)}", "say by --length.map on which the places are"
+                "--length", f"the run has maps {list(maps)}", "say with --length.map which map the places are on"
             )
         wanted = maps[0] if self.map is None else self.map
         if wanted not in maps:
@@ -82,7 +82,7 @@ class ScaleAsked:
             raise InputError(run, "does not exist", "expected a run of `lightdepth densify`")
         if not folders or folders == [run]:
             found = "the folder of one map" if folders else "no map_* folders in it"
-            raise InputError(run, found, "expected a run of `lightdepth densify`, whose maps are told together")
+            raise InputError(run, found, "expected a run of `lightdepth densify`, whose maps are solved together")
         if run_record(run).get("unit") == "mm":
             raise InputError(run, "its surfaces are in mm already", "densify it without --mm-per-unit")
         maps = tuple(one for one in map(_seen, folders) if one is not None)
@@ -134,5 +134,5 @@ def _light_of(run: Path, record: Mapping[str, object]) -> str | None:
     if named is None:
         return None
     if not isinstance(named, str) or ("=" not in named and not Path(named).is_file()):
-        raise InputError(run, f"the light that it was made under is not found ({named})", "give it: --light")
+        raise InputError(run, f"the light that it was made with is not found ({named})", "give it: --light")
     return named

@@ -116,7 +116,7 @@ class _Kept(FunctionCache):
         except OSError:
             return None
         except Exception:  # half a pickle can raise anything
-            warnings.warn(f"{self._cache_path}: damaged machine code is thrown away and made anew", stacklevel=2)
+            warnings.warn(f"{self._cache_path}: damaged machine code is deleted and compiled anew", stacklevel=2)
             self._empty()
             return None
 

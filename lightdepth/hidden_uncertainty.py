@@ -183,7 +183,7 @@ def read_factor(path: Path, *names: str) -> float:
         )
     found = checked_fields(_File, read_json(file), str(file))
     if found.checkpoint not in names:
-        raise InputError(file, f"it is of the checkpoint {found.checkpoint}", f"expected one of {names[0]}")
+        raise InputError(file, f"it was made with the checkpoint {found.checkpoint}", f"expected one of {names[0]}")
     if not (np.isfinite(found.factor) and found.factor > 0):
         raise InputError(file, f"factor: {found.factor}", "expected a positive number")
     return found.factor

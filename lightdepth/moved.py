@@ -72,7 +72,7 @@ class _Moved:
     def exec_module(self, module: ModuleType) -> None:
         old, new = module.__name__, self.moved[module.__name__]
         # The frames between are importlib's own, which warnings leaves out when it counts.
-        warnings.warn(f"{old} is now {new}; the old name goes with the next release", DeprecationWarning, stacklevel=2)
+        warnings.warn(f"{old} is now {new}; the next release drops the old name", DeprecationWarning, stacklevel=2)
         package = sys.modules[old.rpartition(".")[0]]
         if old.rpartition(".")[2] in getattr(package, "__all__", ()):
             package.__class__ = _Package

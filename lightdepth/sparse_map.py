@@ -42,7 +42,7 @@ class Keyframe(Brief):
             raise InputError(
                 f"keyframe {self.name}",
                 f"{len(self.pixels)} keypoints, {len(self.point_ids)} point ids",
-                "expected as many",
+                "expected as many of both",
             )
 
     @property
@@ -106,7 +106,9 @@ class Submap(Brief):
             raise InputError(f"map {self.id}", "it has no keyframes", "expected at least one")
         if len(self.points) != len(self.point_ids):
             raise InputError(
-                f"map {self.id}", f"{len(self.points)} points, {len(self.point_ids)} point ids", "expected as many"
+                f"map {self.id}",
+                f"{len(self.points)} points, {len(self.point_ids)} point ids",
+                "expected as many of both",
             )
         ids, counts = np.unique(self.point_ids, return_counts=True)
         if len(ids) < len(self.point_ids):

@@ -96,7 +96,7 @@ MORE = [
     Command(f"{BATCH} --executor slurm", words="--jobs: 0, with --executor slurm"),
     Command(f"{BATCH} --executor dask", 2, "expected one of local, slurm"),
     Command(f"{BATCH} --slurm.minutes 0", words="--slurm.minutes: 0"),
-    Command(f"{BATCH} --map HERE/colmap", words="would be the map of all"),
+    Command(f"{BATCH} --map HERE/colmap", words="would be one map for all sequences"),
     Command(f"{BATCH} --camera HERE/nowhere.json", words="nowhere.json"),
     Command(f"{BATCH} --mask HERE/nowhere.png", words="nowhere.png"),
     Command(f"{BATCH} --light HERE/nowhere.json", words="nowhere.json"),

@@ -174,7 +174,7 @@ def test_a_row_that_fails_is_in_the_table_and_the_others_are_done(tmp_path, chea
 def test_a_record_that_is_of_no_ablation_is_not_replaced(tmp_path, record):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "run.json").write_text(record)
-    with refused("run.json that is of no ablation", cure="another -o"):
+    with refused("run.json that no ablation made", cure="another -o"):
         run(tmp_path / "run")
     assert (tmp_path / "run" / "run.json").read_text() == record
 

@@ -164,7 +164,7 @@ def test_a_sequence_that_another_run_is_at_is_left_to_it(data, whole, tmp_path, 
     with locked(output / "sequences" / name):
         assert batch(data, output) == 0
         lines = {line["sequence"]: line for line in read_table(output)}
-        assert lines[name]["state"] == "elsewhere" and "another run writes to it" in lines[name]["error"]
+        assert lines[name]["state"] == "elsewhere" and "another run is writing to it" in lines[name]["error"]
         assert not (output / "run.json").exists() and len(stamps(output)) == 3
     assert batch(data, output) == 0
     assert table(output) == table(whole)

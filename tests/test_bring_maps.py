@@ -108,7 +108,7 @@ def test_where_nothing_tells_when_a_clock_began_the_images_do(data, submap, tmp_
     for file in tmp_path.glob("out/*.txt"):
         file.unlink()
     argv = ["--map", tmp_path / "out", "--checkpoint", "decline", "--judge.on=false", "--no-fit-light"]
-    with pytest.warns(UserWarning, match="by the images tracking began 2 frames later"):
+    with pytest.warns(UserWarning, match="the images show that tracking began 2 frames after"):
         assert lightdepth("densify", data, *argv, "-o", tmp_path / "run") == 0
     rows = (tmp_path / "run" / "map_000" / "keyframes.csv").read_text().splitlines()[1:]
     assert [int(row.split(",")[1]) for row in rows] == list(range(2, COUNT))

@@ -49,9 +49,9 @@ def test_a_factor_of_one_leaves_the_map_right_and_says_nothing(slam):
 @pytest.mark.parametrize(
     ("colours", "errors", "ending"),
     [
-        (("amber", "green"), (2.0, 0.5), ": the worse colour is on the worse surface"),
-        (("red", "green"), (0.5, 2.0), ": the worse colour is on the better surface"),
-        (("green", "green"), (2.0, 0.5), ": the colours do not tell them apart"),
+        (("amber", "green"), (2.0, 0.5), ": the worse colour went to the worse surface"),
+        (("red", "green"), (0.5, 2.0), ": the worse colour went to the better surface"),
+        (("green", "green"), (2.0, 0.5), ": the colours do not tell which is worse"),
     ],
 )
 def test_two_lines_give_the_verdicts_and_why_and_the_third_holds_them_against_the_truth(slam, colours, errors, ending):

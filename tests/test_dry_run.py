@@ -177,7 +177,7 @@ def test_it_is_refused_where_another_run_writes_and_takes_no_lock(data, tmp_path
 
     with locked(tmp_path / "out"):
         assert lightdepth("predict", data, *DECLINE, "-o", tmp_path / "out", "--dry-run") == 3
-    assert "another run writes to it (host " in capsys.readouterr().err and all_below(tmp_path) == {}
+    assert "another run is writing to it (host " in capsys.readouterr().err and all_below(tmp_path) == {}
 
 
 def test_it_says_what_would_be_replaced_and_what_is_finished_before(data, tmp_path, capsys):

@@ -349,7 +349,7 @@ def test_depth_that_does_not_fit_16_bits_is_refused(predictions, tmp_path, capsy
     for bad in ("0", "-1"):
         assert main([*argv, bad]) == 3 and "above 0" in capsys.readouterr().err
     argv[argv.index("png")] = "exr"
-    assert main([*argv, "1"]) == 3 and "it is of png" in capsys.readouterr().err
+    assert main([*argv, "1"]) == 3 and "only png has it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("size", ["[100, 0]", "[-5, 5]"])

@@ -49,8 +49,23 @@ def test_work_that_nobody_counts_is_told_every_ten_seconds_with_the_last_line_of
     verb.heart.stage("light: is fitted on the map\nand more")
     verb.works(25)
     assert verb.longest_silence <= SECONDS and len(verb.lines) == 3
-    assert verb.lines[0] == "lightdepth sparse: at work for 10 s"
-    assert verb.lines[2].endswith("since: light: is fitted on the map")
+    assert verb.lines[0].startswith("lightdepth sparse: 10 s so far, still starting")
+    assert "starting" not in verb.lines[2] and verb.lines[2].endswith("since: light: is fitted on the map")
+
+
+def test_a_verb_that_has_said_something_is_no_longer_starting(clock):
+    verb = Verb(clock)
+    verb.works(21)
+    verb.say("a line of its own")
+    verb.works(11)
+    assert ["starting" in line for line in verb.lines] == [True, True, False, False]
+
+
+def test_a_long_line_of_the_log_is_named_by_its_beginning(clock):
+    verb = Verb(clock)
+    verb.heart.stage(f"map_000: {'10 of 10 keyframes aligned, ' * 9}")
+    verb.works(12)
+    assert verb.lines[0].endswith("...") and "map_000: 10 of 10" in verb.lines[0] and len(verb.lines[0]) < 120
 
 
 def test_a_verb_that_says_something_itself_is_not_told_of(clock):
@@ -67,11 +82,21 @@ def test_a_step_that_takes_long_is_told_with_rate_and_time_left(clock, capsys):
         for _ in range(4):
             verb.works(2)
             bar.advance()
-        verb.works(25)
+        verb.works(11)
     assert verb.longest_silence <= SECONDS
     assert verb.lines[-1].startswith("Densifying: 4/10, ") and verb.lines[-1].endswith(
-        " s at the next, 2 s each, about 12 s left"
+        " s into the next, 2 s each, about 12 s left"
     )
+
+
+def test_a_step_that_takes_longer_than_all_was_to_take_has_no_time_left(clock, capsys):
+    verb = Verb(clock)
+    with Progress("Densifying", 10) as bar:
+        for _ in range(6):
+            verb.works(2)
+            bar.advance()
+        verb.works(30)
+    assert "about" in verb.lines[0] and verb.lines[-1].endswith(" s into the next")
 
 
 def test_a_line_that_ends_a_silence_is_not_said_twice(clock, capsys):
@@ -80,7 +105,7 @@ def test_a_line_that_ends_a_silence_is_not_said_twice(clock, capsys):
         for _ in range(80):
             verb.works(0.5)
             bar.advance()
-    assert len(verb.lines) == 4 and "at the next" not in verb.lines[0]
+    assert len(verb.lines) == 4 and "into the next" not in verb.lines[0]
     assert capsys.readouterr().err.splitlines() == ["Matching: 80 in 40.0 s"]
 
 

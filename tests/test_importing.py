@@ -102,11 +102,12 @@ def test_frames_of_other_sources_keep_their_numbers_and_times(tmp_path):
     np.testing.assert_array_equal(read[0].image, frames[5].image)
 
 
-def test_without_a_camera_it_is_imported_and_the_report_says_so(tmp_path):
+def test_without_a_camera_it_is_imported_and_the_report_and_the_next_command_say_so(tmp_path, capsys):
     (tmp_path / "in").mkdir()
     for i in range(12):
         cv2.imwrite(str(tmp_path / "in" / f"Mueller_{i}.png"), picture(i)[..., ::-1])
-    import_frames(tmp_path / "in", tmp_path / "out")
+    assert main(["import", str(tmp_path / "in"), "-o", str(tmp_path / "out")]) == 0
+    assert f"next: lightdepth densify {tmp_path / 'out'} --camera auto -o runs/dense" in capsys.readouterr().out
     assert not (tmp_path / "out" / "camera.json").exists() and "No calibration" in findings(tmp_path / "out")
     with refused(found="no camera.json", cure="give --camera"):
         open_sequence(tmp_path / "out")

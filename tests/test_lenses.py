@@ -236,7 +236,7 @@ def test_a_matrix_in_parts_of_the_sides_is_scaled_and_said(tmp_path, suffix):
     else:
         file = written(tmp_path / f"a.{suffix}", {**SIZE, "camera_matrix": parts, "dist_coeffs": [0.0] * 5})
     with pytest.warns(
-        UserWarning, match="in parts of the image's sides: scaled by 640 and 480 to fx 576, fy 576, cx 320"
+        UserWarning, match="in fractions of the image's sides: scaled by 640 and 480 to fx 576, fy 576, cx 320"
     ):
         camera = read_camera(file, (640, 480))
     assert isinstance(camera, Pinhole) and camera.params == pytest.approx((576.0, 576.0, 320.5, 250.1))

@@ -106,12 +106,14 @@ def test_a_given_gamma_is_kept_and_an_axis_that_is_not_sought_is_the_cameras():
 
 
 def test_boards_that_all_face_the_camera_at_one_distance_do_not_tell_the_place():
-    with refused("the light's place is not told", "tilted by 0 to 1 degrees", cure="tilted by 20 to 45 degrees"):
+    with refused(
+        "the place of the light cannot be determined", "tilted by 0 to 1 degrees", cure="tilted by 20 to 45 degrees"
+    ):
         found_on(paper(tilts=[0, 1, 0, 1, 0, 1], distances=[20] * 6))
 
 
 def test_a_lamp_in_the_middle_of_the_lens_is_not_told_from_no_offset_and_the_interval_is_said():
-    with refused("not told from 0", "±", cure="ring light"):
+    with refused("may as well be 0", "±", cure="ring light"):
         found_on(paper([(0.01, 0.0, -0.5, 1.0)]))
 
 

@@ -41,8 +41,7 @@ def test_an_old_name_gives_the_new_module_and_one_warning_that_names_it():
         """
     )
     assert done.stdout == (
-        "DeprecationWarning lightdepth.ancient is now lightdepth.errors; the old name goes with the next release "
-        "<string>\n"
+        "DeprecationWarning lightdepth.ancient is now lightdepth.errors; the next release drops the old name <string>\n"
     ), done.stderr
 
 

@@ -312,6 +312,7 @@ def test_a_tab_starts_no_python(scripts):
 def test_a_script_is_one_that_its_shell_reads(scripts, shell):
     text = scripts[shell].read_text()
     assert "densify" in text and "fusion.voxel" in text and "next: " not in text and "it belongs to" in text
+    assert ("where FOLDER is one of $fpath" in text) == (shell == "zsh")
     if shutil.which(shell) is None:
         pytest.skip(f"{shell} is not installed")
     subprocess.run([shell, "-n", str(scripts[shell])], check=True)

@@ -67,7 +67,7 @@ def test_a_warning_is_one_sentence_without_a_place_in_the_code(tmp_path):
     done = subprocess.run(argv, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0
     (line,) = done.stderr.splitlines()
-    assert line.startswith("warning: k.yaml: camera_matrix is in parts of the image's sides") and ".py" not in line
+    assert line.startswith("warning: k.yaml: camera_matrix is in fractions of the image's sides") and ".py" not in line
 
 
 def test_how_warnings_look_is_changed_for_the_command_alone(tmp_path):

@@ -103,7 +103,7 @@ def test_settings_that_are_gone_are_left_out_with_one_warning_that_names_them(go
         with pytest.warns(UserWarning) as said:
             argv = gone_settings.without_gone("try", argv)
         assert [str(w.message) for w in said] == [
-            f"{tmp_path / 'c.yaml'}: settings that are no more are left out: "
+            f"{tmp_path / 'c.yaml'}: settings that no longer exist are ignored: "
             "old (it did nothing); part.worn (always on)"
         ]
         assert "old" not in argv[-1] and "number: 5" in argv[-1]

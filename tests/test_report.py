@@ -41,9 +41,18 @@ def test_a_chart_is_light_on_dark_where_the_page_is_dark_and_an_image_stays_as_i
     page.wide_figures([(chart_png(figure), "a chart"), (PIXEL, "an image")])
     page.write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
-    assert '<img class="chart" alt="a chart"' in text and '<img alt="an image"' in text
+    assert '<img class="chart" style="--drawn: 220px" alt="a chart"' in text and '<img alt="an image"' in text
     dark = text[text.index("prefers-color-scheme: dark") :]
     assert "img.chart { filter: invert(" in dark
+
+
+def test_a_chart_of_many_panels_keeps_its_words_legible_on_a_phone_and_is_scrolled_there(tmp_path):
+    page = Report("Charts")
+    page.wide_figures([(chart_png(chart((10, 2))[0]), "broad"), (chart_png(chart((6.4, 2))[0]), "narrow")])
+    page.write(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert text.count('<div class="broad" role="group" tabindex="0"') == 1 and "--drawn: 1100px" in text
+    assert "width: calc(.7 * var(--drawn))" in text[text.index("max-width: 600px") :]
 
 
 def test_many_small_pictures_have_their_words_below_them_and_their_colour_around_them(tmp_path):

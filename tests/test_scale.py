@@ -175,7 +175,7 @@ def test_a_run_whose_light_is_gone_is_told_by_no_other_light(made, told, capsys)
     record["arguments"]["light"] = str(made.parent / "gone.json")
     (made / "run.json").write_text(json.dumps(record))
     assert main(["scale", str(made)]) == 3
-    assert "the light that it was made under is not found" in capsys.readouterr().err
+    assert "the light that it was made with is not found" in capsys.readouterr().err
     assert not (made / "scale").exists()
     assert main(["scale", str(made), "--light", "gamma=2.2,mu=0"]) == 0
 

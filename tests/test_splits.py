@@ -295,7 +295,7 @@ def test_fewer_frames_than_the_data_set_has_are_said(tree, tmp_path):
     path.parent.mkdir(parents=True)
     (tmp_path / "c3vd" / "dataset.yaml").write_text((DATA / "c3vd" / "dataset.yaml").read_text())
     path.write_text("dataset: c3vd\n" + parts(train="desc_t4_a", val="trans_t1_a"))
-    with pytest.warns(UserWarning, match="desc_t4_a: 4 frames; the data set has 148. Is it there whole"):
+    with pytest.warns(UserWarning, match="desc_t4_a: 4 frames; the data set has 148. Is it complete"):
         FrameDataModule(FrameData(split=str(path), root=str(root), size=(25, 20))).setup()
 
 

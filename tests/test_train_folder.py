@@ -99,7 +99,7 @@ def test_a_folder_of_another_program_is_not_gone_on_with_for_a_file_of_the_name_
     (run / "run.json").write_text('{"mine": 1}')
     (run / "log.txt").write_text("mine")
     before = contents(run)
-    with refused("run.json is none of this program", cure="another -o"):
+    with refused("run.json was not written by this program", cure="another -o"):
         train(["-o", str(run), *TINY_RUN, "--resume"])
     assert contents(run) == before
 

@@ -119,6 +119,13 @@ def test_a_large_surface_is_drawn_thinner_says_so_and_is_measured_whole(run):
         assert len(found.viewer._ruler.wall(drawn.viewed).triangles) == 14_400
 
 
+def test_the_map_with_the_best_verdict_is_shown_first(tmp_path):
+    maps = [{"map": i, "verdict": {"colour": colour}} for i, colour in enumerate(("amber", "green"))]
+    (write_run(tmp_path / "run", maps=2) / "run.json").write_text(json.dumps({"verb": "densify", "maps": maps}))
+    with viewing(tmp_path / "run") as found:
+        assert [box.value for box in found.viewer.on.values()] == [False, True]
+
+
 def test_maps_parts_and_colours_are_switched(shown):
     viewer, panel = shown.viewer, shown.panel
     first, second = viewer.maps["map_000"], viewer.maps["map_001"]

@@ -90,9 +90,9 @@ def _check_resumable(output: Path, begun: bool, hidden: bool) -> None:
     """Raises InputError where what says that it is complete is no training, or one that cannot go on."""
     record = read_record(output)
     if record is None and not begun:
-        raise InputError(output, f"not resumed, its {RECORD} is none of this program", "choose another -o")
+        raise InputError(output, f"not resumed, its {RECORD} was not written by this program", "choose another -o")
     if record is not None and record["verb"] != "train":
-        raise InputError(output, f"not resumed, it is of {record['verb']}", "choose another -o")
+        raise InputError(output, f"not resumed, it was made by {record['verb']}", "choose another -o")
     if record is not None and not hidden and not has_checkpoint(output):
         found = "not resumed, it is complete, and its checkpoints are gone"
         raise InputError(output, found, "choose another -o, or give --overwrite to start anew")

@@ -45,7 +45,7 @@ def open_listed(source: Callable[..., SequenceSource], path: str, of: Listed | N
     info, expected = of.split.info, of.split.frame_count(of.chosen.name)
     frames = source(path, None if info is None else info.format).open()
     if expected is not None and len(frames) != expected:
-        warnings.warn(f"{path}: {len(frames)} frames; the data set has {expected}. Is it there whole?", stacklevel=2)
+        warnings.warn(f"{path}: {len(frames)} frames; the data set has {expected}. Is it complete?", stacklevel=2)
     rows = [i for i, number in enumerate(frames.numbers) if of.chosen.takes(number)]
     if not rows:
         raise InputError(

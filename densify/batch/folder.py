@@ -82,7 +82,7 @@ def is_begun(output: Path, arguments: Mapping[str, object]) -> bool:
         return True
     strangers = sorted(p.name for p in output.iterdir() if not hidden(p)) if output.is_dir() else []
     if strangers:
-        raise InputError(output, f"holds {strangers[0]}, which is of no batch", "choose another -o")
+        raise InputError(output, f"holds {strangers[0]}, which no batch made", "choose another -o")
     return False
 
 
@@ -94,7 +94,7 @@ def check_ours(output: Path) -> None:
     """Raises InputError where somebody put something else into an output."""
     for path in sorted(output.iterdir()):
         if path.name not in _OURS and not hidden(path):
-            raise InputError(output, f"holds {path.name}, which is of no batch", "move it elsewhere")
+            raise InputError(output, f"holds {path.name}, which no batch made", "move it elsewhere")
 
 
 def _check_same(output: Path, begun: Mapping[str, Any], said: Mapping[str, Any]) -> None:

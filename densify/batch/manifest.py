@@ -102,13 +102,13 @@ def _rows_of_table(table: Path) -> list[Row]:
             continue
         where = f"{table}: row {number}"
         if any(cell.strip() for cell in cells[len(columns) :]):
-            raise InputError(where, f"{len(cells)} cells", f"expected {len(columns)}, one of each column")
+            raise InputError(where, f"{len(cells)} cells", f"expected {len(columns)}, one for each column")
         row = _row(table, where, number, {c: cell.strip() for c, cell in zip(columns, cells, strict=False)})
         if row.name and (other := names.setdefault(row.name.lower(), number)) != number:
-            raise InputError(where, f"name {row.name}, as in row {other}", "results are called by it: change one")
+            raise InputError(where, f"name {row.name}, as in row {other}", "results are named after it: change one")
         rows.append(row)
     if not rows:
-        raise InputError(table, "no row in it", "expected a line of column names, then a line of each sequence")
+        raise InputError(table, "no row in it", "expected a line of column names, then a line for each sequence")
     return rows
 
 
@@ -138,7 +138,7 @@ def _check_columns(table: Path, columns: list[str]) -> None:
     if "data" not in columns:
         raise InputError(table, "no column data", "expected one with the folder or the video of each sequence")
     if len(set(columns)) < len(columns):
-        raise InputError(table, "a column is there twice", "leave one")
+        raise InputError(table, "a column is there twice", "remove one of the two")
 
 
 def _row(table: Path, where: str, number: int, cells: Mapping[str, str]) -> Row:

@@ -108,10 +108,10 @@ def check_files_of_all(source: SequenceSource, mapped: MapSource) -> None:
         if path is None or "=" in str(path) or (option == "camera" and source.asks_for_camera):
             continue
         if not Path(path).is_file():
-            raise InputError(f"--{option}", f"{path}: no such file", "expected one that serves for all sequences")
+            raise InputError(f"--{option}", f"{path}: no such file", "expected one file for all sequences")
     if mapped.map is not None and mapped.map.is_absolute():
         cure = "expected a path that begins in the folder of each sequence, such as slam"
-        raise InputError("--map", f"{mapped.map}, which would be the map of all", cure)
+        raise InputError("--map", f"{mapped.map}, which would be one map for all sequences", cure)
 
 
 def check_contents_of_all(source: SequenceSource, units: Iterable[Unit]) -> None:

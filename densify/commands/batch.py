@@ -67,7 +67,7 @@ def batch(
         output: Folder with a run of each sequence and the table of all. What is already made there is kept; what failed
             is tried again.
         sfm: how frames are mapped when there is no map
-        fit_light: Where neither --light nor the sequence gives the light, fit it on its map, and use it if depth by it
+        fit_light: Where neither --light nor the sequence gives the light, fit it on its map, and use it if its depth
             fits hidden blocks of wall better; switched off, a usual light is assumed.
         merge: Join submaps that see the same tissue, and write one surface for each group besides the single ones;
             switched off, submaps stay apart.

@@ -191,7 +191,7 @@ def compare_runs(a: Path, b: Path, output: Path | None = None, seed: Annotated[i
         a: File bench.json of the first run, or its folder.
         b: File bench.json of the second run, or its folder.
         output: JSON file to write the comparison to, besides showing it.
-        seed: Number that draws the bootstrap samples, by which noise is told from difference. Another one gives
+        seed: Number that draws the bootstrap samples, which show how large noise is. Another one gives
             slightly different intervals.
     """
     if output is not None:

@@ -39,13 +39,13 @@ def measure_speed(
     seconds: Annotated[float, above(0, up_to=3600)] = 0.7,
     overwrite: bool = False,
 ) -> None:
-    """Every stage beside its floor on this machine and a plain reference, whole runs, and what procedures cost by them.
+    """Each stage beside the least time it could take here and a plain reference, whole runs, and what procedures cost.
 
     Args:
         output: Folder to make, with speed.json, .md and report.html. Where it is runs/speed, dry runs in the same
             folder take their times from it; LIGHTDEPTH_SPEED names another speed.json.
         image_sizes: Widths and heights of the frames, pixels, each measured on its own; a whole run is made at twice
-            the last one's, too. Larger ones and more take longer; costs of other sizes are reckoned from these.
+            the last one's, too. Larger ones and more take longer; costs of other sizes are computed from these.
         keyframes: Number of keyframes of the map that is made for each size; the first has another one, with twice as
             many. More tell better what a keyframe costs and take longer.
         seconds: Time for which a stage and its reference are timed in turns, seconds, for each size; slow ones are

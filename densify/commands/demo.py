@@ -94,7 +94,8 @@ def demo(
         notes = [
             *run.record["in_short"],
             f"A synthetic colon (seed {seed}), {frames} frames, a simulated SLAM export of {len(sparse_map.submaps)} "
-            f"submaps with {spurious:.0%} wrong points; depth by {work.model}. Truth is exact, so errors are errors.",
+            f"submaps with {spurious:.0%} wrong points; depth by {work.model}. The truth is "
+            "exact, so the errors are true ones.",
         ]
         page = densify_page(
             "Demo: from frames to a dense surface",

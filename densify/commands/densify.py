@@ -30,12 +30,12 @@ def densify(
     overwrite: bool = False,
     resume: bool = False,
 ) -> None:
-    """Dense surfaces from frames and a sparse map, one per submap, and one more for submaps that meet.
+    """Dense surfaces from frames and a sparse map, one per submap, and one for joined submaps.
 
     Args:
         output: Run folder to make, with the surfaces and the report.
         sfm: how frames are mapped when there is no map
-        fit_light: Where neither --light nor the folder gives the light, fit it on the map, and use it if depth by it
+        fit_light: Where neither --light nor the folder gives the light, fit it on the map, and use it if its depth
             fits hidden blocks of wall better; switched off, a usual light is assumed.
         merge: Join submaps that see the same tissue, and write one surface for each group besides the single ones;
             switched off, submaps stay apart.

@@ -46,7 +46,7 @@ def evaluate(
         trajectory: TUM file with the pose of every frame that the SLAM localised, judged in place of the keyframes'
             poses.
         fit_light: With --checkpoint, where neither --light nor the truth's folder gives the light, fit it on each map,
-            and use it if depth by it fits hidden blocks of wall better; switched off, a usual light is assumed.
+            and use it if its depth fits hidden blocks of wall better; switched off, a usual light is assumed.
         overwrite: Replace metrics made before (evaluation/ in a run is replaced without asking).
     """
     folder = output or run / "evaluation"

@@ -46,9 +46,9 @@ def export(
         what: Densify run or map folder (colmap, nerfstudio, ply, glb, obj, tum, climb), folder of predict (png, exr),
             or checkpoint (onnx, torch, safetensors).
         output: Folder to make, with a folder for each map, a file for each frame, or the model.
-        to: What to write, which has to be said: colmap, nerfstudio, ply, glb, obj, tum or climb of maps; png (16 bits)
+        to: What to write (required): colmap, nerfstudio, ply, glb, obj, tum or climb of maps; png (16 bits)
             or exr of depth; onnx, torch (torch.export) or safetensors of a network.
-        size: Width and height, pixels, of the only images that an onnx or torch graph shall take; left out, it takes
+        size: Width and height, pixels, of the only images that an onnx or torch graph takes; left out, it takes
             any. A larger one makes the network slower.
         half: Store the weights of safetensors in half precision, as checkpoints are kept; false keeps all digits.
         step: Depth of one code of a 16-bit png, in mm or the unit that the predictions have; left out, a power of ten
@@ -67,7 +67,7 @@ def export(
         raise InputError(path, "no predictions in it", f"expected a folder of `lightdepth predict` for --to {to}")
     model = _network(what) if to in get_args(MODEL_KINDS) else None
     if size is not None and to not in ("onnx", "torch"):
-        raise InputError("--size", f"given with --to {to}", "leave it out: it is of onnx and torch")
+        raise InputError("--size", f"given with --to {to}", "leave it out: only onnx and torch have it")
     if size is not None and min(size) < 1:
         raise InputError("--size", f"{list(size)}", "expected a width and a height of some pixels")
     with run_folder(output, "export", arguments, overwrite) as run:

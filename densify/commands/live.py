@@ -50,7 +50,7 @@ def live(
             units. It is one factor for all submaps, right for those that share a unit. A larger one makes a larger
             surface.
         fit_light: Where neither --light nor the folder gives the light, fit it on the map before the clock starts, and
-            use it if depth by it fits hidden blocks of wall better; switched off, a usual light is assumed.
+            use it if its depth fits hidden blocks of wall better; switched off, a usual light is assumed.
         overwrite: Replace a run made before.
     """
     if not budget_ms > 0:

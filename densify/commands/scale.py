@@ -47,5 +47,5 @@ def scale(
         found.write_file(out.folder, "map units", under, asked.length_record(length))
         out.record["maps"] = [asdict(one) for one in found.maps]
         if not found.told:
-            out.fail("the scale", f"no map has a figure; {found.maps[0]}")
+            out.fail("the scale", f"no map has a scale; {found.maps[0]}")
     end(folder, then="lightdepth measure RUN --points '[[X, Y, Z], [X, Y, Z]]'")

@@ -104,7 +104,7 @@ class DepthReading:
         values, valid = _array(path, self.depth_kind)
         valid &= np.isfinite(values) & (values > 0)
         if not valid.any():
-            raise InputError(path, "no finite number above 0 in it", "leave it out, or is it of another kind?")
+            raise InputError(path, "no finite number above 0 in it", "leave it out, or check --depth-kind")
         values = np.where(valid, values, 1)
         step, own_unit = _own_step(path.parent)
         scale = step if self.depth_scale is None else self.depth_scale
@@ -113,7 +113,7 @@ class DepthReading:
         valid &= np.isfinite(metric) & (metric > 0)
         if not valid.any():
             raise InputError(
-                path, f"no depth that 32 bits hold, with a scale of {scale:g}", "is --depth-scale of another unit?"
+                path, f"no depth that 32 bits hold, with a scale of {scale:g}", "check the unit of --depth-scale"
             )
         metric = np.where(valid, metric, np.float32(1))
         metric, valid = _resized(metric, valid, camera, path)

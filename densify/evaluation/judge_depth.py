@@ -57,7 +57,7 @@ def judge_depth(
         units.add(prediction.unit)
     if not rows:
         raise InputError(
-            truth.source, "no frame has valid true depth", f"begin with the first: {next(iter(skipped.values()))}"
+            truth.source, "no frame has valid true depth", f"the first reason: {next(iter(skipped.values()))}"
         )
     judged = DepthJudged(
         predicted_unit=", ".join(sorted(units)),

@@ -78,7 +78,7 @@ def read_suite(path: Path) -> Suite:
     for group in found.groups:
         for column, folder in group.sequences.items():
             if column in folders or folder in folders.values():
-                raise InputError(path, f"{column} ({folder}) is there twice", "leave one")
+                raise InputError(path, f"{column} ({folder}) is there twice", "remove one of the two")
             folders[column] = folder
     rows = [(r, v, groups) for r, v in found.published.trajectory.items()]
     rows += [(f"{m}: {r}", v, surface) for m, of in found.published.surface.items() for r, v in of.items()]

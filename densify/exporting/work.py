@@ -79,7 +79,7 @@ def _write_map(
     if to == "colmap":
         said = write_colmap(exported, folder, frames, points, bar.advance)
         if not exported.tracked:
-            run.warn(f"{exported.name}: the map's points have no tracks: --map MAP, which the run was made of")
+            run.warn(f"{exported.name}: the map's points have no tracks: give --map MAP, from which the run was made")
     elif to == "nerfstudio":
         said = write_nerfstudio(exported, folder, frames, points, bar.advance)
     elif to == "ply":
@@ -102,7 +102,7 @@ def _keep_origin(run: Run, source: Path, name: str) -> None:
     for file in (folder / "origin.json" for folder in map_folders(source) if folder.name == name):
         if file.is_file():
             (run.folder / name / file.name).write_bytes(file.read_bytes())
-            run.log(f"{name}: the map lies far from its origin; {file.name} has what is to be added")
+            run.log(f"{name}: the map lies far from its origin; {file.name} has the offset to add")
 
 
 def _frames(run: Run, source: Path, given: Path | None) -> FrameSequence | None:

@@ -118,7 +118,7 @@ def _by_images(errors: np.ndarray, level: _Share) -> Kept:
     if share == 1:
         return Kept(1.0)
     wrong = f"the images speak for {max(found, 0):.0%} of the bend to the map's points"
-    return Kept(share, wrong if share else f"{wrong}, too little to tell it from none")
+    return Kept(share, wrong if share else f"{wrong}, which may as well be none")
 
 
 def _rounded(share: float) -> float:

@@ -79,9 +79,9 @@ class Judgement:
         """How far the depth of single keyframes, before it is fused, is from hidden blocks of the map, as `evaluate`
         has it, and from the images; with the constant distance's under the same help."""
         mapped = [float("inf") if w is None else w.median for w in (self.hidden, self.hidden_constant)]
-        told = f"single keyframes' depth is {_beside(*mapped)} from hidden blocks of the map"
+        told = f"the depth of single keyframes differs by {_beside(*mapped)} from hidden blocks of the map"
         if self.images.count:
-            told += f", {_beside(self.images.best, self.images.constant)} from the images"
+            told += f" and by {_beside(self.images.best, self.images.constant)} from the images"
         return told
 
     def record(self) -> dict[str, object]:
@@ -260,7 +260,7 @@ def _no_merit(columns: Columns) -> list[str]:
 
 
 def _beside(value: float, constant: float) -> str:
-    return f"{_share(value)} (a constant distance {_share(constant)})"
+    return f"{_share(value)} (a constant distance by {_share(constant)})"
 
 
 def _share(value: float) -> str:

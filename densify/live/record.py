@@ -104,7 +104,7 @@ class PlayedRun:
             raise InputError(
                 "the maps",
                 "no keyframe of any could be aligned",
-                f"begin with the first: {'; '.join(reasons[:3]) or 'nothing was fused'}",
+                f"the first reasons: {'; '.join(reasons[:3]) or 'nothing was fused'}",
             )
         write_timings(played, run.folder / "timings.csv")
         picture = timings_picture(played, budget_ms / 1000)

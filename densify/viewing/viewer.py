@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from densify.judging.verdict import COLOURS
 from densify.measure import Way
 from densify.viewing.drawn import DrawnMap
 from densify.viewing.known import Known
@@ -128,9 +129,15 @@ class Viewer:
             self.on[viewed.name].on_update(lambda _: self._show())
 
     def _best(self) -> str:
-        """The map that is shown first: a joined one before single ones, then that with most triangles."""
-        sizes = {n: (n.startswith("joined_"), len(m.viewed.read.triangles)) for n, m in self.maps.items()}
-        return max(sizes, key=lambda name: sizes[name])
+        """The map that is shown first: a joined one before single ones, then that with the best verdict, then that with
+        most triangles."""
+
+        def merit(name: str) -> tuple[bool, int, int]:
+            viewed = self.maps[name].viewed
+            worse = COLOURS.index(viewed.colour) if viewed.colour in COLOURS else len(COLOURS)
+            return name.startswith("joined_"), -worse, len(viewed.read.triangles)
+
+        return max(self.maps, key=merit)
 
     def shown(self) -> list[DrawnMap]:
         """The maps that are on."""

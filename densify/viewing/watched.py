@@ -41,6 +41,8 @@ class ViewedMap:
     name: str
     read: DenseMapFiles
     surface: Surface
+    colour: str = ""
+    """of the verdict on it; empty where there is none"""
 
 
 class WatchedRun:
@@ -126,7 +128,16 @@ class WatchedRun:
         rows = read_keyframes(folder, read.numbers.tolist())
         kind, _, number = name.partition("_")
         surface = surface_of_files(f"{kind} {int(number)}", read, rows, error)
-        return ViewedMap(name, read, surface.thinned(self._most))
+        return ViewedMap(name, read, surface.thinned(self._most), self._colour(name))
+
+    def _colour(self, name: str) -> str:
+        """What run.json says of a map; a joined one has no verdict of its own."""
+        maps = self.record.get("maps")
+        for said in maps if isinstance(maps, list) else ():
+            verdict = said.get("verdict") if isinstance(said, dict) else None
+            if isinstance(verdict, dict) and name == f"map_{said.get('map'):0>3}":
+                return str(verdict.get("colour", ""))
+        return ""
 
     def _stamps(self) -> dict[str, Stamp]:
         """Of every map folder that has the files of one, by its name."""

@@ -175,8 +175,8 @@ def _in_pixels(matrix: list[float], width: int, height: int, path: Path) -> list
         return matrix
     scaled = [fx * width, 0, cx * width, 0, fy * height, cy * height, 0, 0, 1]
     warnings.warn(
-        f"{path}: camera_matrix is in parts of the image's sides: scaled by {width} and {height} to fx {scaled[0]:g}, "
-        f"fy {scaled[4]:g}, cx {scaled[2]:g}, cy {scaled[5]:g} pixels",
+        f"{path}: camera_matrix is in fractions of the image's sides: scaled by {width} and {height} to "
+        f"fx {scaled[0]:g}, fy {scaled[4]:g}, cx {scaled[2]:g}, cy {scaled[5]:g} pixels",
         stacklevel=5,
     )
     return scaled

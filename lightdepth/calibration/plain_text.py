@@ -72,7 +72,7 @@ def read_intrinsics(path: Path, size: tuple[int, int] | None) -> Pinhole:
     if size is not None and abs(matrix[:2, :3]).max() < 2 and min(size) >= 16:
         matrix[:2] *= np.array(size, float)[:, None]
         warnings.warn(
-            f"{path}: the matrix is in parts of the image's sides: scaled by {size[0]} and {size[1]} to fx "
+            f"{path}: the matrix is in fractions of the image's sides: scaled by {size[0]} and {size[1]} to fx "
             f"{matrix[0, 0]:g}, fy {matrix[1, 1]:g}, cx {matrix[0, 2]:g}, cy {matrix[1, 2]:g} pixels",
             stacklevel=4,
         )

@@ -35,7 +35,7 @@ def opencv_fields(path: Path) -> dict[str, Any] | None:
     try:
         return {child.tag.lower(): _value(child) for child in root}
     except RecursionError as error:
-        raise InputError(path, "elements inside one another without end", "expected OpenCV's XML") from error
+        raise InputError(path, "elements nested without end", "expected OpenCV's XML") from error
 
 
 def _value(element: Element) -> Any:

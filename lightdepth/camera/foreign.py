@@ -56,7 +56,7 @@ def nearest(lens: ForeignLens, where: str) -> _Fitted:
     fitted = [_fit(model, lens, rays, pixels, weights) for model in (FullBrown, KannalaBrandt)]
     found = [(camera, off) for camera, off in fitted if camera is not None]
     if not found:
-        raise InputError(where, f"{lens.name} lens: the nearest of ours fold inside the image", _UNDISTORT)
+        raise InputError(where, f"{lens.name} lens: its nearest lens models here fold inside the image", _UNDISTORT)
     camera, off = min(found, key=lambda pair: float(pair[1].max()))
     residual = f"off by {np.median(off):.2g} pixels (median), {off.max():.2g} (largest)"
     if off.max() > LARGEST_ERROR_PX:

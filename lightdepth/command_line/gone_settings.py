@@ -67,7 +67,7 @@ def _kept(file: str, gone: Mapping[str, str]) -> str:
         warnings.warn(said, UserWarning, stacklevel=2)
     if found:
         listed = "; ".join(f"{key} ({why})" for key, why in found.items())
-        warnings.warn(f"{file}: settings that are no more are left out: {listed}", UserWarning, stacklevel=2)
+        warnings.warn(f"{file}: settings that no longer exist are ignored: {listed}", UserWarning, stacklevel=2)
     return yaml.safe_dump(settings, sort_keys=False) if found or len(settings) < count else file
 
 

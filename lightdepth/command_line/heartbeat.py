@@ -17,6 +17,8 @@ SECONDS = 10.0
 """The longest silence."""
 _LOOKS = 0.5
 """Seconds between two looks."""
+_SHOWN = 60
+"""Characters of a line of the log that are enough to know it by."""
 
 Activity = Callable[[float], str]
 """What is being done, in words, at a time of the monotonic clock; empty where a bar on the terminal shows it."""
@@ -46,23 +48,31 @@ class Heartbeat:
         self._start = time.monotonic()
         self._verb, self._heard, self._say = verb, heard, say
         self._stage, self._since = "", self._start
+        self._begun, self._own = False, self._start  # whether the verb said anything itself; when this one spoke last
 
     def stage(self, said: str) -> None:
         """A line of the log: what is done from now on."""
-        self._stage, self._since = said.partition("\n")[0], time.monotonic()
+        line = said.partition("\n")[0]
+        self._stage = line if len(line) <= _SHOWN else f"{line[: _SHOWN - 3]}..."
+        self._since = time.monotonic()
 
     def beat(self, now: float) -> None:
         """Says what is at work, where the silence would else be too long before the next look."""
-        if now - max(self._heard(), self._start) < SECONDS - _LOOKS:
+        heard = self._heard()
+        self._begun |= bool(_activities) or (heard > self._start and heard != self._own)
+        if now - max(heard, self._start) < SECONDS - _LOOKS:
             return
         if not _activities:
-            line = f"{self._verb}: at work for {duration(now - self._start)}"
+            line = f"{self._verb}: {duration(now - self._start)} so far"
             if self._stage:
-                line += f", for {duration(now - self._since)} since: {self._stage}"
+                line += f", {duration(now - self._since)} since: {self._stage}"
+            elif not self._begun:
+                line += ", still starting (the first runs on a machine compile loops, once)"
         else:
             line = _activities[-1](now)
         if line:
             self._say(line)
+            self._own = self._heard()
 
 
 @contextmanager

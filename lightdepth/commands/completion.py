@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
 
 from lightdepth.command_line.kinds import choices_of_type, leaves, literals
@@ -24,7 +24,7 @@ _NAME_FILES = ("config", "output", "checkpoint", "checkpoints", "light", "poses"
 """Options of type text that name a file, or may."""
 _PLACES = {
     "bash": "~/.local/share/bash-completion/completions/lightdepth",
-    "zsh": "a folder of $fpath, as _lightdepth",
+    "zsh": "FOLDER/_lightdepth",
     "fish": "~/.config/fish/completions/lightdepth.fish",
 }
 
@@ -38,11 +38,13 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
     import shtab
 
     script = shtab.complete(_all_verbs(), shell)
-    where = f"# Completion of lightdepth for {shell}; it belongs to {_PLACES[shell]}\n"
+    place = _PLACES[shell]
+    where = f"# Completion of lightdepth for {shell}; it belongs to {place}"
+    where += ", where FOLDER is one of $fpath\n" if shell == "zsh" else "\n"
     first, end, rest = script.partition("\n")
     made = f"{first}{end}{where}{rest}" if first.startswith("#") else f"{where}{script}"  # zsh reads the first line
     call = outcome()
-    call.then = f"lightdepth completion {shell} > {_PLACES[shell]}"
+    call.then = f"mkdir -p {PurePosixPath(place).parent} && lightdepth completion {shell} > {place}"
     call.result = {"shell": shell, "script": made}
     call.answer(made.rstrip("\n"))
 

@@ -46,7 +46,7 @@ def convert_camera(
     """
     check_files([output], overwrite, [file, mask])
     if most_px is not None and model is None:
-        raise InputError("--most-px", "given without --model", "leave it out: it is of the fit of another lens model")
+        raise InputError("--most-px", "given without --model", "leave it out: it limits the fit of another lens model")
     camera = read_camera(file, size)
     if size is not None and size != (camera.width, camera.height):
         if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > 0.01:

@@ -110,6 +110,11 @@ def import_frames(
         run.record["frames"] = {"measured": len(scan.rows), "kept": len(chosen)}
         for each in found:
             run.log(f"! {each.found} {each.cure}")
-        run.log(f"{len(chosen)} of {len(scan.rows)} frames kept" + ("" if frames else "; the report alone was written"))
-    then = f"lightdepth densify {quote(str(output))} -o runs/dense" if frames else "lightdepth import VIDEO -o DATA"
+        run.log(f"{len(chosen)} of {len(scan.rows)} frames kept" + ("" if frames else "; only the report was written"))
+    camera = " --camera auto" if geometry.camera is None else ""
+    then = (
+        f"lightdepth densify {quote(str(output))}{camera} -o runs/dense"
+        if frames
+        else "lightdepth import VIDEO -o DATA"
+    )
     end(output, then=then, page=output / "report.html")

@@ -185,7 +185,7 @@ def _checked(
         )
     if said["BurnedInAnnotation"] == "YES":
         warnings.warn(
-            f"{path}: the file says that text is burnt into its pictures: look at them before they leave the house",
+            f"{path}: the file says that text is burnt into its pictures: look at them before you hand them on",
             stacklevel=6,
         )
     aspect = said["PixelAspectRatio"]
@@ -279,9 +279,7 @@ def _times(said: dict[str, Any], count: int, path: Path) -> np.ndarray | None:
     if len(steps) == count and count > 1 and ((steps[1:] > 0) & (steps[1:] < _LONGEST_MS)).all():
         return np.asarray(np.cumsum(np.concatenate([[0.0], steps[1:]])) / 1000)
     if len(steps):
-        warnings.warn(
-            f"{path}: the header's FrameTimeVector does not fit {count} frames: it is left aside", stacklevel=7
-        )
+        warnings.warn(f"{path}: the header's FrameTimeVector does not fit {count} frames: it is ignored", stacklevel=7)
     for element in ("FrameTime", "CineRate", "RecommendedDisplayFrameRate"):
         value = _numbers(said[element])
         if len(value) == 1 and 0 < value[0] < _LONGEST_MS:

@@ -225,7 +225,7 @@ def warn_of_orientation(source: Path, images: Sequence[Path]) -> None:
         image, head = found[0]
         warnings.warn(
             f"{source}: {image.name} has EXIF orientation {head.orientation} ({len(found)} of {len(images[::step])} "
-            "looked at); it is left aside: pixels are taken as they are stored, and so are camera and mask",
+            "checked); it is ignored: pixels are taken as they are stored, and so are camera and mask",
             stacklevel=6,
         )
 
@@ -273,7 +273,7 @@ def warn_of_gaps(source: Path, numbers: Sequence[int], known: Container[int]) ->
     if 0 < len(without) < len(numbers):
         warnings.warn(
             f"{source}: no depth for {len(without)} of {len(numbers)} frames, the first is frame {without[0]}; they "
-            "have no truth. Is the data set there whole?",
+            "have no truth. Is the data set complete?",
             stacklevel=5,
         )
 

@@ -206,7 +206,7 @@ def _check_overlap(path: Path, parts: Mapping[str, tuple[Chosen, ...]], leaks: M
             for other_part, other in before.setdefault(key, []):
                 also = "" if other.name == c.name else f", which is {other.name},"
                 if other_part == part:
-                    raise InputError(path, f"{part} has {c}{also} twice", "leave one")
+                    raise InputError(path, f"{part} has {c}{also} twice", "remove one of the two")
                 found = f"{c} of {part}{also} is in {other_part} too"
                 if key not in allowed:
                     raise InputError(
@@ -215,7 +215,7 @@ def _check_overlap(path: Path, parts: Mapping[str, tuple[Chosen, ...]], leaks: M
                         "a sequence belongs to one part. A published split that cuts it in two says so under leaks",
                     )
                 if c.frames is None or other.frames is None or _meet(c.frames, other.frames):
-                    raise InputError(path, f"{found} ({other}), with frames in both", "give ranges that do not meet")
+                    raise InputError(path, f"{found} ({other}), with frames in both", "give ranges that do not overlap")
             before[key].append((part, c))
     pointless = [name for name in leaks if len(before.get(same_sequence(name), [])) < 2]
     if pointless:

@@ -149,7 +149,7 @@ class VideoFile:
                 raise InputError(
                     self.path,
                     f"frame {index} of {len(self)} does not decode: the file is damaged there",
-                    "leave this one out; others are given",
+                    "leave this one out; the others can be read",
                 )
             decoder.pending, decoder.at = None, at + 1
             if at == index:

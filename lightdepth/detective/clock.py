@@ -43,8 +43,9 @@ def by_the_images(sparse_map: SparseMap, frames: FrameSequence) -> SparseMap:
         return sparse_map
     was = "with hardly a frame" if at_hand is None else f"{at_hand:.2f}"
     warnings.warn(
-        f"{sparse_map.source}: by the images tracking began {best} frames later than the clock's first stamp was taken "
-        f"for (patches around one map point have an NCC of {usable[best]:.2f} in two keyframes, {was} as it was): "
+        f"{sparse_map.source}: the images show that tracking began {best} frames after the frame that the "
+        f"clock's first stamp was taken for (patches around one map point have an NCC of {usable[best]:.2f} in two "
+        f"keyframes, {was} as it was): "
         f"keyframes are counted from there. --frame-offset {best} says so, and --time-offset the clock itself",
         stacklevel=2,
     )

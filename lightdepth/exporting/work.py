@@ -37,7 +37,7 @@ def export_depth(run: Run, folder: Path, to: str, step: float | None) -> None:
     """Depth along the axis of every prediction of a folder, as 16-bit PNG or EXR."""
     files = sorted(folder.glob("*.npz"))
     if step is not None and to != "png":
-        raise InputError("--step", f"given with --to {to}", "leave it out: it is of png")
+        raise InputError("--step", f"given with --to {to}", "leave it out: only png has it")
     unit, largest = "", 0.0
     for file in files:
         prediction = read_prediction(file)

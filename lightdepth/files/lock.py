@@ -73,7 +73,7 @@ def check_free(output: Path) -> None:
         with lock_path(output).open("rb") as file:
             holder = _read(file.fileno())
         raise InputError(
-            output, f"another run writes to it ({_told(holder)})", "wait for its end, or choose another -o"
+            output, f"another run is writing to it ({_told(holder)})", "wait until it ends, or choose another -o"
         )
 
 
@@ -120,14 +120,14 @@ def _opened(path: Path, output: Path) -> int:
             holder = _read(descriptor)
             os.close(descriptor)
             raise InUse(
-                output, f"another run writes to it ({_told(holder)})", "wait for its end, or choose another -o"
+                output, f"another run is writing to it ({_told(holder)})", "wait until it ends, or choose another -o"
             ) from None
         except OSError:  # a file system without locks: the process alone tells
             holder = _read(descriptor)
             if holder and _is_ours(holder) and _lives(holder):
                 os.close(descriptor)
                 raise InUse(
-                    output, f"another run writes to it ({_told(holder)})", f"wait for its end, or remove {path}"
+                    output, f"another run is writing to it ({_told(holder)})", f"wait for its end, or remove {path}"
                 ) from None
         if not _is_at(descriptor, path):  # its holder has just removed it
             os.close(descriptor)

@@ -54,9 +54,9 @@ def reading(
     except EOFError as error:
         raise InputError(path, "cannot be read (it ends too early)", cure) from error
     except MemoryError as error:
-        raise InputError(path, "it asks for more memory than there is", cure) from error
+        raise InputError(path, "it needs more memory than there is", cure) from error
     except RecursionError as error:
-        raise InputError(path, "its parts lie inside one another without end", cure) from error
+        raise InputError(path, "its parts are nested without end", cure) from error
     except Exception as error:  # whatever a broken file makes a parser stumble over
         raise InputError(path, f"not {what} ({said(error)})", cure) from error
 

@@ -29,7 +29,7 @@ def read_json(path: Path) -> Any:
     except ValueError as error:
         raise InputError(path, f"not valid JSON ({error})", "correct it there") from error
     except RecursionError as error:
-        raise InputError(path, "not valid JSON (brackets in one another without end)", "correct it there") from error
+        raise InputError(path, "not valid JSON (brackets nested without end)", "correct it there") from error
 
 
 def checked_fields(schema: type[_Schema], data: Any, where: str) -> _Schema:

@@ -45,8 +45,8 @@ def of_frames(measures: Measures, fate: np.ndarray, times: np.ndarray) -> list[F
     if share(BLURRED) > BLURRED_SHARE:
         findings.append(
             Finding(
-                f"{share(BLURRED):.0%} of the frames are blurred beside their neighbours, and were left out.",
-                "Fast passages carry little; choose a calmer part with --start and --end, or lower --blur.",
+                f"{share(BLURRED):.0%} of the frames are blurred compared with their neighbours, and were left out.",
+                "Fast passages are of little use; choose a calmer part with --start and --end, or lower --blur.",
             )
         )
     if (fate == FROZEN).any():
@@ -61,7 +61,7 @@ def of_frames(measures: Measures, fate: np.ndarray, times: np.ndarray) -> list[F
         findings.append(
             Finding(
                 f"{int((fate == DOUBLE).sum())} frames ({share(DOUBLE):.0%}) are doubles: they repeat the frame "
-                "before, singly or by a few, while the camera moves. They were left out.",
+                "before, one or a few at a time, while the camera moves. They were left out.",
                 "Nothing, times stay true. The recorder ran faster than the endoscope: one that counts frames at the "
                 "file's rate, such as a SLAM, counts the doubles too.",
             )
@@ -81,7 +81,7 @@ def of_frames(measures: Measures, fate: np.ndarray, times: np.ndarray) -> list[F
         findings.append(
             Finding(
                 f"{saturated:.0%} of the tissue is saturated (white in all channels).",
-                "Light that is clipped says nothing of distance: lower the light source or the gain when recording.",
+                "Clipped light says nothing about distance: lower the light source or the gain when recording.",
             )
         )
     if dark > DARK_SHARE or float(np.median(measures.brightness[known])) < DARK_BRIGHTNESS:
@@ -89,7 +89,7 @@ def of_frames(measures: Measures, fate: np.ndarray, times: np.ndarray) -> list[F
             Finding(
                 f"Dark: median brightness {np.median(measures.brightness[known]):.0f} of 255, {dark:.0%} of the tissue "
                 f"below {BLACK}.",
-                "Little light comes back, so noise and response decide: raise the light, or leave this part out.",
+                "Little light comes back, so noise and the response dominate: raise the light, or leave this part out.",
             )
         )
     jumps = exposure_jumps(measures)
@@ -107,7 +107,7 @@ def of_frames(measures: Measures, fate: np.ndarray, times: np.ndarray) -> list[F
         findings.append(
             Finding(
                 "The pictures are grey: the three channels are the same.",
-                "Albedo cannot be told by colour; expect worse depth than on colour video.",
+                "Albedo cannot be found from colour; expect worse depth than on colour video.",
             )
         )
     elif means[0] < max(means[1:]):

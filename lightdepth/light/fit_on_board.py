@@ -193,8 +193,8 @@ def _whites(frames: FrameSequence, board: Board) -> tuple[list[White], int]:
             frames.source,
             f"the board's corners lie {astray:.2%} of the image's width from their places (median over "
             f"{seen} frames), in {counted(len(found), 'frame')} no farther than {MOST_ASTRAY:.1%}{there}",
-            f"expected at most {MOST_ASTRAY:.1%}, in {LEAST_FRAMES} frames at least: is the camera that of these "
-            "frames, are the board's sizes its own, and is it flat?",
+            f"expected at most {MOST_ASTRAY:.1%}, in {LEAST_FRAMES} frames at least: is this the camera of these "
+            "frames, are the sizes those of the board, and is it flat?",
         )
     clipped = float(np.median([white.clipped for white in found]))
     usable = [white for white in found if len(white) >= LEAST_CELLS]
@@ -254,12 +254,12 @@ def _check(found: BoardFit, source: str) -> None:
             source,
             f"lamps beside the lens leave {found.left:.1%} of the white's brightness unexplained",
             f"expected at most {MOST_LEFT:.0%}: matt paper in a dark room, and a camera without tone mapping or "
-            "enhancement; are there more lamps?",
+            "enhancement; or does it have more lamps?",
         )
     if float(wide.max()) > WIDEST_MM:
         raise InputError(
             source,
-            f"the light's place is not told: {place} ({poses})",
+            f"the place of the light cannot be determined: {place} ({poses})",
             f"expected ± {WIDEST_MM:g} mm at most: photograph the board from near (10 to 40 mm) and tilted by 20 to 45 "
             "degrees to all sides, a dozen times",
         )
@@ -268,9 +268,9 @@ def _check(found: BoardFit, source: str) -> None:
     if aside <= reach:
         raise InputError(
             source,
-            f"the light is {aside:.2f} ± {reach:.2f} mm beside the lens, which is not told from 0 ({place}; {poses})",
-            "a ring light, or lamps around the lens, have no side: millimetres cannot be told from them. Where the "
-            "lamp is on one side, give more and nearer boards",
+            f"the light is {aside:.2f} ± {reach:.2f} mm beside the lens, which may as well be 0 ({place}; {poses})",
+            "a ring light, or lamps around the lens, have no side: they tell no millimetres. If the lamp is on one "
+            "side, photograph the board more often and from nearer",
         )
 
 

@@ -261,7 +261,7 @@ def fit_assumed_light(
         run.record["light_fit"] = light_fit
         return None if kept is None else PhotometricCalibration(**kept)
     start = time.perf_counter()
-    run.log("light: is fitted on the map, and judged on hidden blocks of wall")
+    run.log("light: fitting it on the map, and judging it on hidden blocks of wall")
     found: dict[str, object] = {"used": False}
     light = None
     try:

@@ -172,6 +172,11 @@ def chart(size: tuple[float, float] = (6.4, 3.0)) -> tuple[Any, Any]:
 class Chart(bytes):
     """A PNG of lines and words on white, and of no image: a page that is dark shows it light on dark."""
 
+    @property
+    def width(self) -> int:
+        """In pixels, as the PNG's header has it."""
+        return int.from_bytes(self[16:20], "big")
+
 
 def chart_png(figure: Any) -> Chart:
     buffer = io.BytesIO()

@@ -79,20 +79,23 @@ class Progress:
         if self._bar is not None or self._hidden:
             return ""
         self._last = now
-        long = self.done < self.total and now - self._since >= 1
-        at_it = f", {duration(now - self._since)} at the next" if long else ""
-        return f"{self.label}: {self.done}/{self.total}{at_it}{self._left()}"
+        waited = now - self._since
+        at_it = f", {duration(waited)} into the next" if self.done < self.total and waited >= 1 else ""
+        return f"{self.label}: {self.done}/{self.total}{at_it}{self._left(waited)}"
 
-    def _left(self) -> str:
-        """The rate and the time left, in words; empty where they cannot be told yet."""
+    def _left(self, waited: float = 0.0) -> str:
+        """The rate and the time left, in words; empty where they are not known, or where the step at work has lasted
+        for longer than all was to take."""
         if not self._recent:
             return ""
         (since, before), (now, done) = self._recent[0], self._recent[-1]
         if now - since < _LEAST_SECONDS or done - before < max(_LEAST_STEPS, _LEAST_SHARE * self.total):
             return ""
         each = (now - since) / (done - before)
+        if waited > (left := each * (self.total - done)):
+            return ""
         rate = f"{1 / each:.3g} a second" if each < 1 else f"{each:.3g} s each"
-        return f", {rate}, about {duration(each * (self.total - done))} left"
+        return f", {rate}, about {duration(left)} left"
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -27,6 +27,8 @@ _KINDS = {b"\xff\xd8": "jpeg", b"RIFF": "webp"}
 """Pictures by how they begin; others are PNG."""
 _SHORT = 14
 """Characters of a cell that stay in one line."""
+_WIDE = 720
+"""Width of a chart, pixels, from which on its words are too small to read when all of it is on a phone's page."""
 SMALL = 110
 """Width of a tile of many, pixels of the page: three beside each other on a phone."""
 _OF_EVERY_RUN = [
@@ -152,12 +154,15 @@ def _shown(text: str) -> str:
 
 
 def _figure(data: bytes, caption: str) -> str:
-    return f"<figure>{_image(data, caption)}<figcaption>{_shown(caption)}</figcaption></figure>"
+    image = _image(data, caption)
+    if isinstance(data, Chart) and data.width > _WIDE:
+        image = f'<div class="broad" role="group" tabindex="0" aria-label="{_shown(caption)}">{image}</div>'
+    return f"<figure>{image}<figcaption>{_shown(caption)}</figcaption></figure>"
 
 
 def _image(data: bytes, words: str) -> str:
     kind = next((kind for begin, kind in _KINDS.items() if data.startswith(begin)), "png")
-    drawn = ' class="chart"' if isinstance(data, Chart) else ""
+    drawn = f' class="chart" style="--drawn: {data.width}px"' if isinstance(data, Chart) else ""
     return f'<img{drawn} alt="{_shown(words)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
 
 

@@ -47,7 +47,7 @@ def _check_whole(output: Path, record: Mapping[str, Any]) -> None:
 def check_same(output: Path, begun: Mapping[str, Any], verb: str, arguments: Mapping[str, Any]) -> None:
     """Raises InputError, naming what differs, unless this is the run that was begun there."""
     if begun["verb"] != verb:
-        raise InputError(output, f"not resumed, it is of {begun['verb']}, not of {verb}", "choose another -o")
+        raise InputError(output, f"not resumed, it was made by {begun['verb']}, not by {verb}", "choose another -o")
     if (version := begun.get("version", own_version())) != own_version():
         found = f"not resumed, it was begun by version {version}, and this is {own_version()}"
         raise InputError(output, found, "go on with that version, or give --overwrite to start anew")

@@ -49,7 +49,7 @@ def made_sparse(
         run.record["known_poses"] = plain(found.poses)
     if found.failed:
         reasons = summary(list(found.failed.values()))
-        run.log(f"{len(found.failed)} of {len(frames)} frames found no place: {reasons}")
+        run.log(f"{len(found.failed)} of {len(frames)} frames got no pose: {reasons}")
         for name, reason in found.failed.items():
             run.log(f"  {name}: {reason}")
     run.record["unregistered"] = found.failed

@@ -67,7 +67,7 @@ def ablate(
 
     Args:
         output: Run folder, with the table (ablation.md). Trainings already in it are kept where their settings are the
-            same, so that a broken-off run goes on.
+            same, so that a stopped run goes on.
         base: YAML file of options of `train` that the training of every row starts from; --settings and the row's own
             come on top, and a row's own preset replaces its model part. Another file compares changes to another
             training.
@@ -117,10 +117,10 @@ def ablate(
 def _check_ours(output: Path) -> None:
     """Raises InputError where a folder holds what no ablation writes: it would be listed as the run's, or replaced."""
     if os.path.lexists(output / RECORD) and ((record := read_record(output)) is None or record["verb"] != "ablate"):
-        raise InputError(output, f"holds a {RECORD} that is of no ablation", "choose another -o")
+        raise InputError(output, f"holds a {RECORD} that no ablation made", "choose another -o")
     for path in sorted(output.iterdir()) if output.is_dir() else ():
         if path.name not in _OURS and not re.fullmatch(r"seed_-?\d+", path.name) and not hidden(path):
-            raise InputError(output, f"holds {path.name}, which is of no ablation", "choose another -o")
+            raise InputError(output, f"holds {path.name}, which no ablation made", "choose another -o")
 
 
 def _ablate(

@@ -80,7 +80,7 @@ def adapt(
         raise InputError(
             "--points, --overlap",
             f"{config.points}, {config.overlap} without --map and with --judge none",
-            "expected a map that teaches where they are above 0",
+            "give --map FILE to learn from, or 0 for both",
         )
     arguments = recorded(
         source,

@@ -155,7 +155,7 @@ def select(
             raise InputError(
                 data,
                 f"none of the {len(verdicts)} frames is kept ({_counts(verdicts)})",
-                "loosen what rejects them; nothing was written",
+                "loosen the limits that reject them; nothing was written",
             )
         summary = f"{sum(v.kept for v in verdicts)} of {len(verdicts)} frames kept; rejected: {_counts(verdicts)}"
         folder = f"{data.resolve().name}/" if with_folder else ""
@@ -224,7 +224,7 @@ def _check_finished(paths: Mapping[str, Path], made_by: str, no_frames: bool) ->
     lines = output.read_text(encoding="utf-8", errors="replace").split("\n")
     said = [line for line in lines if line.startswith("# run ")]
     if not said or not said[-1].startswith(f"# run {made_by}, "):
-        raise InputError(output, "not resumed, it is of other frames or settings", cure)
+        raise InputError(output, "not resumed, it was made with other frames or settings", cure)
     if said[-1] != _comment(_ending(made_by, sum(bool(line) and not line.startswith("#") for line in lines))):
         raise InputError(output, "not resumed, it is finished, but was changed since", cure)
     for what, path in paths.items():

@@ -179,7 +179,7 @@ def select_by_matching(
         if len(node.views) > rules.max_views:
             node = None
     if not views_in:
-        raise InputError("the frames", "none could be read", f"begin with the first: {trouble}")
+        raise InputError("the frames", "none could be read", f"the first reason: {trouble}")
     good = {id for id, views in views_in.items() if views >= rules.min_views}
     counts = [s.features for s in seen if s.node in good and s.features is not None]
     least = rules.blur * float(np.median(counts)) if counts else 0.0
