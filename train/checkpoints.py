@@ -112,6 +112,11 @@ def _keep(path: Path, previous: Path) -> None:
         beside.unlink(missing_ok=True)  # which a rename leaves where both are one file already: after a kill
 
 
+def exported_of(folder: Path, best: bool) -> Path:
+    """The checkpoint that a run exports: its best one where it is asked for, as one may be there of other settings."""
+    return folder / (BEST if best and (folder / BEST).exists() else LAST)
+
+
 def clear_cut_off(folder: Path) -> None:
     """Removes what a killed run had written of checkpoints: the next ones may have other names."""
     for path in folder.glob(".*"):

@@ -45,7 +45,7 @@ from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit
 from .board import hyper_parameters, opening
 from .callbacks import validation_line
 from .card import Card, Doubt
-from .checkpoints import BEST, LAST, Start, clear_cut_off, newest
+from .checkpoints import BEST, LAST, Start, clear_cut_off, exported_of, newest
 from .colons import TubeData
 from .costs import training_steps
 from .datamodule import FrameDataModule, warn
@@ -59,8 +59,6 @@ from .watching import Echo, FitConfig
 from .watching import with_callbacks as _with_callbacks
 
 _PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mixed")
-
-
 _FIT = FitConfig()
 T = TypeVar("T")
 
@@ -195,8 +193,7 @@ def _fitted(
         train_loss = trainer.callback_metrics.get("train/loss")
         received.stop(f"all steps are kept in {LAST}: --resume exports the model")
 
-    by_best = job.settings.monitor != "last" and (checkpoints / BEST).exists()  # one may be of other settings
-    chosen = checkpoints / (BEST if by_best else LAST)
+    chosen = exported_of(checkpoints, job.settings.monitor != "last")
     found = trainer.validate(model, datamodule=data, ckpt_path=chosen, verbose=False, weights_only=True)[0]
     errors = {key.removeprefix("val/"): float(value) for key, value in found.items()}
     data.gather()
