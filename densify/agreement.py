@@ -76,6 +76,10 @@ class AgreementConfig:
     at a pixel and are not compared there; live compares none. A larger one compares more pixels."""
 
 
+MOST_AT_ONCE = 32_000
+"""Places that cv2.remap is given at once: of 32767 in a row it takes no more."""
+
+
 @dataclass(frozen=True, repr=False)
 class View(Brief):
     """A keyframe as the agreement sees it: what it observed, its log predicted distance at few rows (h, w) float32
@@ -98,6 +102,9 @@ class View(Brief):
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Log predicted distance (n,) at x (n, 2) in [0, 1]², and where it is known (n,)."""
+        if len(x) > MOST_AT_ONCE:
+            first, rest = self.at(x[:MOST_AT_ONCE]), self.at(x[MOST_AT_ONCE:])
+            return np.concatenate([first[0], rest[0]]), np.concatenate([first[1], rest[1]])
         height, width = self.valid.shape
         place = (x * (width, height) - 0.5).astype(np.float32)
         inside = ((place >= 0) & (place <= (width - 1, height - 1))).all(1)

@@ -36,16 +36,17 @@ MODEL_STEPS = ("read", "predict")
 """Steps that a dry run tries on the spot: the frames are at hand, and so is the model."""
 _LIGHT = 26 * 3
 """Predictions that finding a light on the map takes at the most: keyframes, by as many lights."""
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0, le=1e15, allow_inf_nan=False)]
+_Pixels = Annotated[int, Field(gt=0, le=100_000)]
 
 
 class WholeRun(BaseModel):
     """A run of densify over one map, from frames and map to its page, in a process that had all modules loaded."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
-    size: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
+    size: tuple[_Pixels, _Pixels]
     """width and height of its frames"""
-    keyframes: Annotated[int, Field(gt=0)]
+    keyframes: Annotated[int, Field(gt=0, le=10**9)]
     seconds: _Positive
     processor: _Positive
     """seconds of all its threads together"""
@@ -69,7 +70,7 @@ class SpeedFile(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
     kind: Literal["bench speed"]
-    slowness: _Positive
+    slowness: Annotated[float, Field(ge=1e-4, le=1e4)]
     """how many times slower the machine was than the one of the tables"""
     runs: Annotated[list[WholeRun], Field(min_length=1)]
 

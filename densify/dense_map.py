@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields
@@ -33,6 +34,7 @@ DOUBTED = 0.03
 """Expected error of a vertex, as a share of the distance of a typical inlier, at which its confidence is one half."""
 
 
+_NUMBER = re.compile(r"(?:map_|joined_)?([0-9]+)")
 _FAR = 16  # times its size, twice the distance from the origin: from there on it is taken about its own middle
 
 
@@ -315,16 +317,21 @@ def read_keyframes(folder: Path, numbers: Sequence[int]) -> list[KeyframeRow]:
 
 
 def map_folders(path: Path) -> list[Path]:
-    """The map folders of a densify run, or the folder itself where it is one (map_000, joined_000); else none."""
+    """The map folders of a densify run, or the folder itself where it is one (map_000, joined_000); else none. What has
+    no number in its name (map_notes) is not of the run."""
     if (path / "mesh.ply").is_file() and (path / "trajectory.tum").is_file():
         return [path]
-    return sorted(p for p in path.glob("map_*") if p.is_dir()) if path.is_dir() else []
+    return _numbered(path, "map_*")
 
 
 def surface_folders(path: Path) -> list[Path]:
     """The map folders of a densify run, then those of its joined surfaces; or the folder itself where it is one."""
     found = map_folders(path)
-    return found if found == [path] else found + sorted(p for p in path.glob("joined_*") if p.is_dir())
+    return found if found == [path] else found + _numbered(path, "joined_*")
+
+
+def _numbered(path: Path, names: str) -> list[Path]:
+    return sorted(p for p in path.glob(names) if p.is_dir() and _NUMBER.fullmatch(p.name))
 
 
 def run_record(path: Path) -> Mapping[str, object]:
@@ -345,11 +352,11 @@ def read_dense_map(folder: str | Path) -> DenseMapFiles:
     for name in ("mesh.ply", "sparse.ply", "trajectory.tum", "camera.json"):
         if not (folder / name).is_file():
             raise InputError(folder, f"{name} missing", "expected a map folder of a `lightdepth densify` run")
-    map_id = folder.name.removeprefix("map_").removeprefix("joined_")
-    if not (map_id.isascii() and map_id.isdigit()):
+    map_id = _NUMBER.fullmatch(folder.name)
+    if map_id is None:
         raise InputError(folder, "no number of a map in its name", "expected a name such as map_000 or joined_000")
     with reading(folder, "a readable map folder"):
-        found = _dense_map(folder, int(map_id))
+        found = _dense_map(folder, int(map_id[1]))
     known = found.camera.provenance
     if known is not None and known.doubt:
         warnings.warn(known.doubt, stacklevel=2)

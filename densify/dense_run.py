@@ -94,13 +94,13 @@ def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = F
 
 
 @contextmanager
-def unheard(words: Sequence[str], keep_names: bool = False) -> Iterator[None]:
+def unheard(words: Sequence[str], goes_on: str, keep_names: bool = False) -> Iterator[None]:
     """Runs made within it say nothing to the terminal (their logs have it), and note `words` as the command line: the
-    real one may name patients."""
+    real one may name patients. `goes_on` is how one that is stopped goes on, empty where none does."""
     with ExitStack() as ending:
         ending.callback(setattr, sys, "argv", sys.argv)
         sys.argv = list(words)
-        for variable, value in ((KEPT, keep_names), (OUTCOME, Outcome(quiet=True))):
+        for variable, value in ((KEPT, keep_names), (OUTCOME, Outcome(quiet=True, goes_on=goes_on))):
             ending.callback(variable.reset, variable.set(value))  # type: ignore[arg-type]  # each has its own type
         for redirected in (redirect_stdout, redirect_stderr):
             ending.enter_context(redirected(io.StringIO()))

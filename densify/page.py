@@ -34,6 +34,9 @@ from lightdepth.reporting.report import Report, Tile, number
 from lightdepth.reporting.scene import Scene, Surface
 from lightdepth.sparse_map import SparseMap, Submap
 
+PICTURED = 12
+"""The most maps that have pictures in a report, some half a megabyte each."""
+
 
 class Gallery:
     """Pictures of a few keyframes of every submap, taken as they pass, and small ones of more keyframes."""
@@ -114,8 +117,11 @@ def densify_page(
         _coverage(page, results, mm_per_unit)
     if any(r.judgement for r in results):
         _judged(page, results)
+    pictured = sorted(results, key=lambda r: -len(r.dense.triangles))[:PICTURED]
+    if len(pictured) < len(results):
+        page.text(f"Pictures are of the {len(pictured)} largest maps, so that this page stays small.")
     for result in results:
-        _submap(page, result, gallery)
+        _submap(page, result, gallery, any(result is one for one in pictured))
     _times(page, results)
     return page
 
@@ -129,11 +135,11 @@ def joined_section(page: Report, merged: Merged) -> None:
         state = "joined" if j.ok else f"not joined: {j.reason}"
         rows.append([f"maps {j.target} and {j.source}", j.by, f"{j.agreeing} of {j.matches}", gap, state])
     page.table(["", "by", "correspondences that agree", "gap between the surfaces, share of the distance", ""], rows)
-    for result, group in zip(merged.results, merged.groups, strict=True):
+    for place, (result, group) in enumerate(zip(merged.results, merged.groups, strict=True)):
         maps = ", ".join(map(str, sorted(group)))
         page.heading(f"Maps {maps} as one ({joined_name(result)})")
         page.text(f"In the frame of reference and unit of map {next(iter(group))}; fused anew from all keyframes.")
-        if len(result.dense.triangles):
+        if len(result.dense.triangles) and place < PICTURED:
             for row in mesh_pictures(result.dense, f"maps {maps}"):
                 page.figures(row)
 
@@ -270,7 +276,7 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
             page.text(f"Map {result.dense.submap.id}: {' '.join(said)}")
 
 
-def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:
+def _submap(page: Report, result: SubmapResult, gallery: Gallery, pictured: bool) -> None:
     dense = result.dense
     page.heading(f"Map {dense.submap.id}")
     left_out = [a for a in dense.alignments if not a.ok]
@@ -278,6 +284,8 @@ def _submap(page: Report, result: SubmapResult, gallery: Gallery) -> None:
         page.text(f"Keyframe {a.keyframe} left out: {a.reason}")
     if len(left_out) > 5:
         page.text(f"… and {len(left_out) - 5} more (keyframes.csv)")
+    if not pictured:
+        return
     for row in mesh_pictures(dense):
         page.figures(row)
     page.wide_figures(

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from densify.dense_map import map_folders, run_record
+from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.light.millimetres import Millimetres
 from lightdepth.photometry import PhotometricCalibration
@@ -122,6 +123,15 @@ def scale_of(run: Path, map_id: int) -> MapScale | None:
     fields = checked_fields(_ScaleFields, read_json(path), str(path))
     found = {one.map: MapScale(**one.model_dump()) for one in fields.maps}
     return found.get(_unit_of(run, map_id) if own and run.name.startswith("joined_") else map_id)
+
+
+def scales_in(folder: Path) -> bool:
+    """Whether a folder has a scale.json with a figure in it; one that is spoilt has none."""
+    try:
+        fields = checked_fields(_ScaleFields, read_json(folder / FILE), str(folder / FILE))
+    except (InputError, OSError):
+        return False
+    return any(one.mm_per_unit is not None for one in fields.maps)
 
 
 def unit_told(folder: Path) -> str:

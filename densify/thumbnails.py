@@ -32,6 +32,8 @@ OFF = 0.25
 PICTURES = 24
 """The most keyframes whose pictures are in a report."""
 _WIDTH = 240  # of such a picture
+_ENOUGH = 2 * _WIDTH
+"""Pixels across, about, of what is coloured before it is made smaller: of large frames every so manieth is taken."""
 _LEVELS = 11  # colours of dots, an odd number: one is white
 
 
@@ -48,8 +50,10 @@ class Thumbnails:
         name, number = aligned.keyframe.name, aligned.keyframe.number
         if number in self.rows or seen.frame is None or seen.prediction is None:
             return
-        valid, sigma = seen.prediction.valid, seen.prediction.uncertainty
-        distance = colored_distance(seen.prediction.distance, valid)
+        few = (slice(None, None, max(1, seen.prediction.valid.shape[1] // _ENOUGH)),) * 2
+        valid, sigma = seen.prediction.valid[few], seen.prediction.uncertainty
+        sigma = None if sigma is None else sigma[few]
+        distance = colored_distance(seen.prediction.distance[few], valid)
         unsure = None if sigma is None else uncertainty_colors(sigma, valid)
         residual = residual_picture(aligned, seen.frame.image)
         shown = [None if p is None else thumbnail(p, _WIDTH) for p in (distance, unsure, residual)]
@@ -90,7 +94,8 @@ def residual_picture(aligned: AlignedKeyframe, image: np.ndarray) -> np.ndarray 
     residual = residuals(aligned)
     if residual is None or aligned.observed is None:
         return None
-    grey = 0.55 * np.repeat(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY)[..., None], 3, 2)
+    small = cv2.cvtColor(thumbnail(image, _WIDTH), cv2.COLOR_RGB2GRAY)
+    grey = np.rint(0.55 * np.repeat(small[..., None], 3, 2)).astype(np.uint8)
     levels = np.linspace(-1, 1, _LEVELS)
     nearest = np.abs(np.clip(residual / OFF, -1, 1)[:, None] - levels).argmin(1)
     colors = signed_colors(levels[None], np.ones((1, _LEVELS), bool))[0]
@@ -98,7 +103,7 @@ def residual_picture(aligned: AlignedKeyframe, image: np.ndarray) -> np.ndarray 
     groups = []
     for k in order:
         red, green, blue = map(int, colors[k])
-        groups.append((aligned.observed.pixels[nearest == k], (red, green, blue)))
+        groups.append((aligned.observed.pixels[nearest == k] * (_WIDTH / image.shape[1]), (red, green, blue)))
     return marked_points(grey, groups, _WIDTH)
 
 

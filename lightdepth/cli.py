@@ -20,7 +20,7 @@ from typing import Any
 
 from lightdepth import __version__
 from lightdepth.command_line.dry import DRY, Planned
-from lightdepth.command_line.outcome import manners, outcome, planned, speaking
+from lightdepth.command_line.outcome import Outcome, in_turn, manners, outcome, planned, speaking
 from lightdepth.command_line.own_packages import own_packages_first
 from lightdepth.command_line.pipes import fill_closed_streams, outliving_readers
 from lightdepth.command_line.verbs import all_verbs, summary_of, verb_parser
@@ -43,15 +43,23 @@ or other work leaves fewer cores than the machine has."""
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed, 5 the machine failed
-    (disk, memory, a folder that is gone), 128 + n ended by signal n."""
+    (disk, memory, a folder that is gone), 128 + n ended by signal n. In threads, calls with --json or --quiet wait for
+    each other."""
     fill_closed_streams()
     if argv is None:  # a process of its own, in which nothing is loaded yet
         os.environ.setdefault(*ONE_THREAD)
+    call, given = manners(sys.argv[1:] if argv is None else argv)
+    call.version = __version__
+    with in_turn(call):
+        return _called(call, given)
+
+
+def _called(call: Outcome, given: list[str]) -> int:
+    """The exit code of a call, of which all is said by then."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show ends no run
-    call, given = manners(sys.argv[1:] if argv is None else argv)
-    call.version, code = __version__, 0
+    code = 0
     try:
         with ending_on_signals(), outliving_readers(), warnings_as_sentences(), speaking(call) as ended:
             # A run's own context: what one says of names does not hold for the next.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_agreement_mutants import CAMERA, RIGID, SIZE, distances_to_plane, facing, keyframe_at, unbent, view_of
@@ -22,6 +24,7 @@ from densify.agreement import (
 )
 from densify.agreement import unbent as start
 from densify.bending import Bend, BendingConfig
+from densify.judging.doubts import sigma_at
 from lightdepth.observations import ObservedDistances
 from lightdepth.prediction import DepthPrediction
 
@@ -136,6 +139,21 @@ def test_a_view_knows_nothing_beside_its_image_and_where_a_neighbour_is_unknown(
     np.testing.assert_allclose(log[sure], np.log(20), rtol=1e-6)
     assert View.of(keyframe_at(), view.observed, prediction, 1.0, 40).valid.shape == (40, 48)
     assert View.of(keyframe_at(), view.observed, prediction, 1.0, 500).valid.shape == (80, 96)
+
+
+def test_more_places_are_looked_at_than_opencv_takes_in_a_row():
+    view, count = facing(0, 20.0), 66_000
+    assert len(view.grid(300)) > 32767  # --agreement.samples 300
+    x = np.random.default_rng(0).uniform(0.1, 0.9, (count, 2))
+    log, sure = view.at(x)
+    for few in (slice(0, 100), slice(32_000, 32_100), slice(count - 100, count)):
+        np.testing.assert_array_equal(log[few], view.at(x[few])[0])
+    assert log.shape == (count,) and sure.all()
+    depth = DepthPrediction("1", np.full(SIZE[::-1], 20.0), np.ones(SIZE[::-1], bool), CAMERA, "flat")
+    doubtful = replace(depth, uncertainty=np.tile(np.linspace(0.1, 0.2, SIZE[0]), (SIZE[1], 1)).astype(np.float32))
+    sigma = sigma_at(doubtful, x * SIZE)
+    assert sigma is not None and sigma.shape == (count,)
+    np.testing.assert_array_equal(sigma[-100:], sigma_at(doubtful, x[-100:] * SIZE))
 
 
 def test_a_gap_is_the_reach_less_the_distance_there():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import re
@@ -14,9 +15,11 @@ from sequences import batch, called, killed_after, made_sequences, quick_run, re
 from test_names import telling
 
 import densify.batch.make
+from densify.batch import work
 from densify.batch.make import Maker
 from lightdepth.errors import InputError, Interrupted
 from lightdepth.files.lock import locked
+from lightdepth.reporting.run import recorded, run_folder
 
 CANARY = "MUSTERMANN_Erika"
 
@@ -134,6 +137,63 @@ def test_a_sequence_that_is_not_there_is_a_line_of_its_own_and_stops_nothing(dat
     done, missing = read_table(tmp_path / "out")
     assert done["state"] == "done" and missing["state"] == "failed" and missing["sequence"] == "row-0002"
     assert "does not exist" in missing["error"] and CANARY not in missing["error"] and missing["frames"] is None
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {"verdict": ["green"], "maps": {"0": 1}, "failures": "none", "seconds": "long"},
+        {"verdict": {"colour": ["green"], "number": {}}, "maps": [3, {"coverage": "all", "keyframes": "many"}]},
+        {"verdict": {"colour": "mauve", "number": True}, "failures": [4], "seconds": float("inf")},
+        {"maps": [{"coverage": {"well_share": "half"}, "vertices": float("nan")}]},
+    ],
+)
+def test_a_run_json_that_somebody_wrote_to_costs_its_own_figures_and_no_other_line(data, whole, tmp_path, spoilt):
+    output = tmp_path / "out"
+    shutil.copytree(whole, output)
+    name = sorted(stamps(output))[0]
+    path = output / "sequences" / name / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | spoilt))
+    assert batch(data, output) == 0
+    lines = {line["sequence"]: line for line in table(output)}
+    mine = lines.pop(name)
+    assert mine["state"] == "done" and mine["verdict"] == (None if "verdict" in spoilt else "green")
+    assert (mine["vertices"] == 0) == ("maps" in spoilt) and json.dumps(mine, allow_nan=False)
+    assert list(lines.values()) == [line for line in table(whole) if line["sequence"] != name]
+
+
+def test_of_thousands_of_rows_that_are_not_there_ten_are_named_and_the_others_counted(data, tmp_path, capsys):
+    first = sorted(data.iterdir())[0]
+    (tmp_path / "list.csv").write_text("data\n" + "".join(f"nowhere/{i}\n" for i in range(25)) + f"{first}\n")
+    assert batch(tmp_path / "list.csv", tmp_path / "out") == 4
+    said = capsys.readouterr().err
+    assert sum(": failed: " in line for line in said.splitlines()) == 10 and "/26 seq-" in said
+    assert "15 more cannot be read: the table has them all" in said
+    assert sum(line["state"] == "failed" for line in read_table(tmp_path / "out")) == 25
+
+
+@pytest.mark.parametrize("where", ["sequence", "note", "table"])
+def test_on_a_full_disk_it_is_said_that_the_same_command_goes_on(data, tmp_path, monkeypatch, capsys, where):
+    """It has no --resume."""
+
+    def halfway(asked, model, output, overwrite=False, resume=False):
+        with run_folder(output, "densify", recorded(asked.source), overwrite, resume) as run:
+            (run.folder / "a").write_text("a finished part")
+            run.finish_part("a")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "table.csv")
+
+    monkeypatch.setattr(densify.batch.make, "dense_run", quick_run if where == "table" else halfway)
+    if where != "sequence":
+        monkeypatch.setattr(*((densify.batch.make, "write_whole") if where == "note" else (work, "write_table")), full)
+    code = batch(data, tmp_path / "out", "--shard", "1/4")
+    said = capsys.readouterr().err
+    assert "--resume" not in said and "the disk is full" in said and "the same command goes on" in said
+    assert code == (4 if where == "sequence" else 5)
+    assert ("1 finished part is kept" in said) == (where == "sequence")
+    assert ("Finished sequences are kept" in said) == (where != "sequence")
 
 
 def test_a_fault_of_the_program_is_tried_twice_and_kept_with_its_trace(data, tmp_path, monkeypatch, capsys):

@@ -94,6 +94,23 @@ def test_a_file_without_runs_that_can_be_reckoned_with_is_refused(here, runs):
         read_speed(written(here / "speed.json", runs=runs))
 
 
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {"slowness": 1e-320},
+        {"runs": [RUNS[0].model_dump() | {"keyframes": 10**400}]},
+        {"runs": [RUNS[0].model_dump() | {"size": [10**200, 10**200]}]},
+        {"runs": [RUNS[0].model_dump() | {"seconds": 1e308}]},
+    ],
+)
+def test_numbers_that_no_run_can_have_are_refused_and_spoil_no_dry_run(here, monkeypatch, spoilt):
+    file = written(here / "runs" / "speed" / "speed.json", **spoilt)
+    assert known_cost().by == "by a table"
+    monkeypatch.setenv(GIVEN, str(file))
+    with refused(where=GIVEN):
+        known_cost()
+
+
 def test_a_benchmark_s_plan_goes_with_the_measured_keyframe(here):
     _, work = bench_plan(BenchConfig())
     before = work()[0].seconds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +12,24 @@ import pytest
 import trimesh
 from colons import colon, sequence, slam, truth
 from raising import refused
+from view_runs import write_run
 
 from densify.alignment import Alignment
 from densify.config import DensifyConfig
-from densify.dense_map import GREEN, GREY, RED, DenseMap, Surface, read_dense_map, write_cloud
+from densify.dense_map import (
+    GREEN,
+    GREY,
+    RED,
+    DenseMap,
+    Surface,
+    map_folders,
+    read_dense_map,
+    surface_folders,
+    write_cloud,
+)
 from densify.judging.config import JudgeConfig
 from densify.pipeline import densify
+from densify.viewing.watched import WatchedRun
 from lightdepth import native
 from lightdepth.calibration import read_camera
 from lightdepth.files.tum import read_tum
@@ -232,3 +245,15 @@ def test_a_surface_is_as_exact_far_from_the_origin_as_near(off):
     assert distance == pytest.approx([0.125, 0.25], abs=1e-6) and triangle.tolist() == [1, 0]
     places, _ = surface.closest(above)
     assert places - off == pytest.approx(np.array([[0.25, 0.5, 0], [0.75, 0.25, 0]]), abs=1e-6)
+
+
+def test_a_folder_without_a_number_is_no_map_of_a_run(tmp_path):
+    """Notes that somebody put beside the maps."""
+    run = write_run(tmp_path / "run")
+    for name in ("map_notes", "joined_old", "map_000.bak", "map_\u0661"):
+        (run / name).mkdir()
+    assert [f.name for f in surface_folders(run)] == ["map_000"] == [f.name for f in map_folders(run)]
+    assert [each.name for each in WatchedRun(run).first()] == ["map_000"]
+    shutil.rmtree(run / "map_000")
+    with refused(found="no map_* folders"):
+        WatchedRun(run)

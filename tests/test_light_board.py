@@ -18,6 +18,7 @@ from lightdepth.datasets import SequenceSource
 from lightdepth.errors import MissingOption
 from lightdepth.frame import Frame
 from lightdepth.light.board import Board, BoardConfig, find_board
+from lightdepth.light.board_page import board_page
 from lightdepth.light.board_pose import Pose, White, board_pose, white_paper
 from lightdepth.light.fit_on_board import LampsConfig, fit_on_board, fit_on_white
 from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
@@ -86,6 +87,15 @@ def test_what_the_lens_darkens_is_told_from_the_lamps_spread_and_both_are_in_mu(
     assert found.lamp_mu == pytest.approx(1.5, abs=0.3) and found.lens_mu == pytest.approx(1.6, abs=0.35)
     light = found.light
     assert light.lamps is not None and light.mu == pytest.approx(found.lamp_mu + light.lamps.lens_mu, abs=1e-3)
+
+
+def test_a_lens_that_brightens_to_its_side_is_said_to_do_so(tmp_path):
+    found = found_on(paper(lens=-0.8))
+    assert found.lens_mu < -0.3
+    assert f"the lens {found.lens_mu:.2f} (below 0: images are brighter at the edge" in found.summary()
+    board_page(found, "paper").write(tmp_path / "page.html")
+    assert "below 0: images are brighter at the edge" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "below 0" not in found_on(paper(lens=0.8)).summary()
 
 
 def test_two_lamps_are_told_from_one_by_frames_that_were_kept_from_the_fit():

@@ -10,7 +10,10 @@ import shutil
 import signal
 import subprocess
 import warnings
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
+from threading import Barrier, BrokenBarrierError
 
 import pytest
 from test_options import every_verb, parsers
@@ -320,3 +323,23 @@ def test_a_script_is_one_that_its_shell_reads(scripts, shell):
 
 def test_zsh_knows_from_the_first_line_what_the_script_is_for(scripts):
     assert scripts["zsh"].read_text().startswith("#compdef lightdepth\n")
+
+
+def test_two_threads_that_ask_for_json_at_once_get_a_document_each(monkeypatch, capfd):
+    together = Barrier(2)
+
+    def work(argv: list[str]) -> int:
+        print(f"words of {argv[0]}")
+        with suppress(BrokenBarrierError):
+            together.wait(0.5)  # the other one, where it does not wait for its turn
+        return 0
+
+    monkeypatch.setattr("lightdepth.cli._main", work)
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(main, [["doctor", "--json"], ["demo", "--json"]])) == [0, 0]
+    said, told = capfd.readouterr(), []
+    while text := said.out.strip():
+        found, end = json.JSONDecoder().raw_decode(text)
+        told.append(found["verb"])
+        said = said._replace(out=text[end:])
+    assert sorted(told) == ["demo", "doctor"] and said.err.count("words of") == 2

@@ -112,3 +112,27 @@ def test_without_the_package_the_install_command_is_said_and_the_browser_s_packa
         assert done.returncode == ending, done.stderr
         assert (tmp_path / f"{absent}.rrd").is_file() == (ending == 0)
         assert ("pip install 'lightdepth[rerun]'" in done.stderr) == (ending == 3)
+
+
+def test_on_a_full_disk_a_recording_ends_with_a_sentence_and_leaves_nothing(run, tmp_path):
+    """In a process of its own, whose files may not grow beyond 64 KiB; the package's own writer waits without end."""
+    code = (
+        "import resource, signal, sys\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "from lightdepth.cli import main\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, 1 << 16))\n"
+        "sys.exit(main(['view', {!r}, '--rerun', {!r}]))"
+    ).format(str(run), str(tmp_path / "out" / "run.rrd"))
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300, stdin=subprocess.DEVNULL
+    )
+    assert done.returncode == 5 and "grew beyond the size that is allowed here" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("off", ["0", "OFF"])
+def test_where_the_environment_switches_the_package_off_that_is_said(run, tmp_path, monkeypatch, off):
+    monkeypatch.setenv("RERUN", off)
+    with refused(where="RERUN", found="switches the package off"):
+        view(run, rerun=tmp_path / "run.rrd")
+    assert list(tmp_path.iterdir()) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -192,6 +193,34 @@ def test_where_every_map_is_refused_it_is_4_and_no_figure_stands_anywhere(made, 
     assert main(["measure", str(made), "--map", "0", "--points", "[[0, 0, 10], [0, 10, 0]]"]) == 0
     said = capsys.readouterr().out
     assert "straight 14.1 map units" in said and "map 0: no millimetres, shading hardly changes" in said
+
+
+def test_a_scale_that_finds_nothing_leaves_the_figures_of_before(made, told, capsys):
+    told(figure(2.0), figure(3.0))
+    assert main(["scale", str(made)]) == 0 and main(["scale", str(made), "-o", str(made.parent / "own")]) == 0
+    before = (made / "scale" / "scale.json").read_text()
+    told(figure(2.345, FLAT), figure(2.345, FLAT))
+    capsys.readouterr()
+    assert main(["scale", str(made)]) == 4
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "map 1: no millimetres, shading hardly changes" in said and "keeps the figures that it had" in said
+    assert main(["scale", str(made), "-o", str(made.parent / "own"), "--overwrite"]) == 4
+    for folder in (made / "scale", made.parent / "own"):
+        assert (folder / "scale.json").read_text() == before and json.loads((folder / "run.json").read_text())
+    assert sorted(p.name for p in made.iterdir()) == ["map_000", "map_001", "run.json", "scale"]
+    (made / "scale" / "scale.json").write_text("spoilt")
+    shutil.rmtree(made.parent / "own")
+    assert main(["scale", str(made), "-o", str(made.parent / "own")]) == 4
+    assert json.loads((made.parent / "own" / "scale.json").read_text())["maps"][0]["mm_per_unit"] is None
+
+
+def test_the_reason_of_a_run_of_one_map_is_told_once(tmp_path, told, capsys):
+    told(figure(2.345, FLAT))
+    made = run_of(tmp_path, (0,), LIGHT)
+    assert main(["scale", str(made)]) == 4
+    ended = capsys.readouterr()
+    assert (ended.out + ended.err).count("shading hardly changes") == 1
+    assert "shading hardly changes" in (made / "scale" / "log.txt").read_text()
 
 
 def test_one_map_with_a_figure_is_0_and_the_other_is_warned_of(made, told, capsys):

@@ -15,8 +15,8 @@ from densify.alignment import Alignment
 from densify.bending import Bend, BendingConfig
 from densify.config import DensifyConfig
 from densify.dense_map import KeyframeRow, read_dense_map
-from densify.page import Gallery
-from densify.pipeline import densify
+from densify.page import Gallery, densify_page
+from densify.pipeline import SubmapResult, densify
 from densify.predictions import SeenKeyframe
 from densify.scene import KINDS, surface_of_files
 from densify.thumbnails import OFF, Thumbnails, residual_picture, residuals
@@ -117,3 +117,16 @@ def test_how_well_each_vertex_was_seen_is_in_the_mesh_and_a_colour_of_what_is_re
     assert old.seen is None and "How well seen" not in [x.title for x in surface_of_files("map 0", old, rows).layers]
     strange = replace(read, seen=kinds + 7)
     assert "How well seen" not in [x.title for x in surface_of_files("map 0", strange, rows).layers]
+
+
+def test_of_many_maps_the_largest_alone_have_pictures_in_a_report(tmp_path, monkeypatch):
+    """A screening has dozens of them, of half a megabyte each."""
+    monkeypatch.setattr("densify.page.PICTURED", 1, raising=False)
+    results = [SubmapResult(dense_tube(number)) for number in (0, 1)]
+    small = replace(results[1].dense, triangles=results[1].dense.triangles[:2000])
+    results[1] = replace(results[1], dense=small)
+    page = densify_page("Many", results, Gallery(SparseMap(tuple(r.dense.submap for r in results), "test")), [])
+    page.write(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "Surface of map 0 from outside" in text and "Surface of map 1 from outside" not in text
+    assert "<h2>Map 1</h2>" in text and "Pictures are of the 1 largest maps" in text

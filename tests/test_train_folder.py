@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import logging
+import math
 import os
 import resource
 import shutil
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,8 +21,11 @@ from training import TINY_RUN
 from lightdepth.cli import main
 from lightdepth.files.writing import PARTIAL, our_mark, write_whole
 from lightdepth.reporting.unfinished import begin
+from lightdepth.signals import Received
+from train.checkpoints import Checkpoints
 from train.commands.train import train
 from train.folder import check_output, training_folder
+from train.running import quiet
 
 
 @contextmanager
@@ -112,3 +118,38 @@ def test_a_whole_run_without_its_checkpoints_is_not_replaced_unasked(finished_ru
     with refused("its checkpoints are gone", cure="--overwrite"):
         train(["-o", str(run), "--resume", "--trainer.max_steps", "4"])
     assert contents(run) == before and json.loads(before["run.json"])["steps"] == 2
+
+
+def test_a_run_that_goes_on_to_its_last_step_exports_that_and_not_what_chose_before(finished_run, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished_run, run)
+    assert (run / "checkpoints" / "best.ckpt").is_file()
+    assert train(["-o", str(run), "--resume", "--trainer.max_steps", "3", "--fit.monitor", "last"]) == 0
+    card = (run / "model.md").read_text(encoding="utf-8")
+    assert "- checkpoint: last" in card and "- steps: 3" in card and "chose" not in card
+    assert "These frames also chose the checkpoint" in (finished_run / "model.md").read_text(encoding="utf-8")
+
+
+def test_the_least_value_of_one_measure_is_not_held_against_another(tmp_path):
+    def checkpoints(monitor: str) -> Checkpoints:
+        return Checkpoints(tmp_path, monitor, 10, 0, Received(), None)
+
+    saved = {**checkpoints("val/loss").state_dict(), "best": 0.25, "best_batches": 10}
+    for monitor, best in (("val/loss", 0.25), ("val/photometric", math.inf)):
+        found = checkpoints(monitor)
+        found.load_state_dict(saved)
+        assert found.state_dict()["best"] == best
+
+
+def test_after_a_training_the_process_warns_and_logs_as_before(recwarn):
+    def state() -> tuple[object, ...]:
+        levels = [logging.getLogger(name).level for name in ("lightning.pytorch", "lightning.fabric")]
+        return list(warnings.filters), levels, torch.get_float32_matmul_precision()
+
+    before = state()
+    with quiet():
+        warnings.warn("the loader does not have many workers", stacklevel=1)
+        assert state() != before
+    assert state() == before and not recwarn.list
+    warnings.warn("the loader does not have many workers", stacklevel=1)
+    assert len(recwarn.list) == 1

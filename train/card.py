@@ -12,6 +12,14 @@ from lightdepth.losses import LossConfig
 from lightdepth.network import NetworkConfig
 
 
+def chosen_said(measure: str) -> str:
+    """What errors are worth on frames that chose the checkpoint, in two sentences."""
+    return (
+        f"These frames also chose the checkpoint, as the one of their least {measure}: errors on them flatter it. "
+        "Frames that neither taught nor chose say how good it is: predict some that have truth, and evaluate them."
+    )
+
+
 class Sparsification(TypedDict):
     """Areas between the sparsification curve and the best one there could be, as shares of a random order's."""
 
@@ -53,6 +61,8 @@ class Card:
     """version of this program"""
     uncertainty: Doubt | None = None
     """how good its uncertainty is, where it has a calibrated one"""
+    chosen_by: str = ""
+    """the measure that chose this checkpoint on the validation frames; empty where they chose nothing"""
 
     def record(self) -> dict[str, object]:
         """As the file of a model holds it."""
@@ -85,6 +95,8 @@ class Card:
                 lines.append(f"| {who} | " + " | ".join(f"{value:.3f}" for value in values) + " |")
         else:
             lines.append(f"Validation loss (no truth): {errors.get('loss', math.nan):.4f}")
+        if self.chosen_by:
+            lines += ["", chosen_said(self.chosen_by)]
         if self.uncertainty is not None:
             found = self.uncertainty["sparsification"]
             shares = ", ".join(f"{level}: {share:.1%}" for level, share in self.uncertainty["coverage"].items())

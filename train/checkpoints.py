@@ -112,6 +112,11 @@ def _keep(path: Path, previous: Path) -> None:
         beside.unlink(missing_ok=True)  # which a rename leaves where both are one file already: after a kill
 
 
+def exported_of(folder: Path, best: bool) -> Path:
+    """The checkpoint that a run exports: its best one where it is asked for, as one may be there of other settings."""
+    return folder / (BEST if best and (folder / BEST).exists() else LAST)
+
+
 def clear_cut_off(folder: Path) -> None:
     """Removes what a killed run had written of checkpoints: the next ones may have other names."""
     for path in folder.glob(".*"):
@@ -139,9 +144,12 @@ class Checkpoints(pl.Callback):
         self._between = resumed is not None and resumed.path.name == LAST and resumed.step % every != 0
 
     def state_dict(self) -> dict[str, object]:
-        return {"best": self._best, "best_batches": self._best_batches, "planned": self._planned}
+        best = {"best": self._best, "best_batches": self._best_batches}
+        return {**best, "planned": self._planned, "monitor": self.monitor}
 
     def load_state_dict(self, state_dict: Mapping[str, object]) -> None:
+        if state_dict.get("monitor", self.monitor) != self.monitor:
+            return  # the least value of another measure says nothing of this one's
         self._best, self._best_batches = float(str(state_dict["best"])), int(str(state_dict["best_batches"]))
 
     def on_save_checkpoint(

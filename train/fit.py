@@ -45,7 +45,7 @@ from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit
 from .board import hyper_parameters, opening
 from .callbacks import validation_line
 from .card import Card, Doubt
-from .checkpoints import BEST, LAST, Start, clear_cut_off, newest
+from .checkpoints import BEST, LAST, Start, clear_cut_off, exported_of, newest
 from .colons import TubeData
 from .costs import training_steps
 from .datamodule import FrameDataModule, warn
@@ -59,12 +59,11 @@ from .watching import Echo, FitConfig
 from .watching import with_callbacks as _with_callbacks
 
 _PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mixed")
-
-
 _FIT = FitConfig()
 T = TypeVar("T")
 
 
+@quiet()
 def fit(
     model: LightDepth,
     data: FrameDataModule,
@@ -92,7 +91,6 @@ def fit(
             "expected 32-true, 16-mixed or bf16-mixed",
         )
     check_trainer_options(trainer_options)
-    quiet()
     if is_dry():
         _planned(model, data, output, trainer_options, resume)
     job = _Job(config_yaml, seed, arguments or [], settings, resume)
@@ -195,7 +193,7 @@ def _fitted(
         train_loss = trainer.callback_metrics.get("train/loss")
         received.stop(f"all steps are kept in {LAST}: --resume exports the model")
 
-    chosen = checkpoints / (BEST if (checkpoints / BEST).exists() else LAST)
+    chosen = exported_of(checkpoints, job.settings.monitor != "last")
     found = trainer.validate(model, datamodule=data, ckpt_path=chosen, verbose=False, weights_only=True)[0]
     errors = {key.removeprefix("val/"): float(value) for key, value in found.items()}
     data.gather()
@@ -242,11 +240,13 @@ def _exported(
         tube=data.tube if data.tube.scenes or data.tube.val_scenes else None,
         errors=errors,
         version=versions().get("lightdepth", "not installed"),
+        chosen_by=job.settings.monitor if chosen.name == BEST else "",
     )
     save_model(exported.network, folder / "model.safetensors", card.record())
     output = output_of(folder) or folder
     write_whole(folder / "model.md", card.text(output.name))
-    page = training_page([card.trained_on, f"{steps} steps, seed {job.seed}; the {chosen.stem} checkpoint."], errors)
+    told = [card.trained_on, f"{steps} steps, seed {job.seed}; the {chosen.stem} checkpoint."]
+    page = training_page(told, errors, card.chosen_by)
     if (batch := next(iter(data.val_dataloader()), None)) is not None:
         pictured = (folder / "uncertainty.png").read_bytes() if doubt is not None else None
         device = next(exported.network.parameters()).device

@@ -14,6 +14,7 @@ from lightdepth.reporting.figures import Chart, chart_png, jpeg
 from lightdepth.reporting.report import Report, Tile
 
 from .board import Seen, decline, panels_of
+from .card import chosen_said
 
 SHOWN = 6
 """The most frames that are shown."""
@@ -31,11 +32,11 @@ _MEASURES = {
 }
 
 
-def training_page(said: Sequence[str], errors: Mapping[str, float]) -> Report:
+def training_page(said: Sequence[str], errors: Mapping[str, float], chosen_by: str = "") -> Report:
     """The verdict and the figures; `said` are sentences on what was learned from, `errors` by name, those of the closed
-    form after `closed_form/`."""
+    form after `closed_form/`; `chosen_by` is the measure by which the frames of the verdict chose the checkpoint."""
     page = Report("Training")
-    page.text(verdict(errors))
+    page.text(verdict(errors, chosen_by))
     for sentence in said:
         page.text(sentence)
     if "abs_rel_median" in errors:
@@ -48,8 +49,12 @@ def training_page(said: Sequence[str], errors: Mapping[str, float]) -> Report:
     return page
 
 
-def verdict(errors: Mapping[str, float]) -> str:
-    """Whether the network is better than the formula that needs no training, in a sentence."""
+def verdict(errors: Mapping[str, float], chosen_by: str = "") -> str:
+    """Whether the network is better than the formula that needs no training, in a sentence, and what that is worth."""
+    return " ".join(filter(None, [_compared(errors), chosen_said(chosen_by) if chosen_by else ""]))
+
+
+def _compared(errors: Mapping[str, float]) -> str:
     if "abs_rel_median" not in errors:
         loss = errors.get("loss", float("nan"))
         return f"The validation frames have no truth: their loss, {loss:.4g}, says little of how good depth is."
@@ -77,4 +82,5 @@ def show_frames(page: Report, network: DepthNetwork, batch: FrameBatch, loss: Lo
         page.tiles(tiles, f"Frame {i + 1}", 150)
     page.wide_figures([(chart_png(decline(batch, seen, count)), "Brightness of these frames over distance")])
     if doubt is not None:
-        page.wide_figures([(Chart(doubt), "How far the stated uncertainty can be trusted")])
+        said = "How far the stated uncertainty can be trusted, on the frames that it was calibrated on"
+        page.wide_figures([(Chart(doubt), said)])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import lightning.pytorch as pl
 import torch
@@ -38,16 +39,35 @@ def report_every(steps: int) -> int:
     return 50 if steps <= 0 else max(1, min(100, steps // 10))
 
 
-def quiet() -> None:
-    """Lightning's tips and hardware lists do not belong in a log; its warnings that matter stay."""
-    for name in ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero"):
-        logging.getLogger(name).setLevel(logging.ERROR)
-    warnings.filterwarnings("ignore", ".*does not have many workers.*")
-    warnings.filterwarnings("ignore", ".*number of training batches.*")
-    warnings.filterwarnings("ignore", ".*exists and is not empty.*")
-    warnings.filterwarnings("ignore", ".*isn't supported for scheduler.*")
-    warnings.filterwarnings("ignore", ".*dirpath has changed.*")
-    warnings.filterwarnings("ignore", ".*LeafSpec.*")
-    warnings.filterwarnings("ignore", ".*mid-epoch.*|.*ended.*epoch.*")
-    warnings.filterwarnings("ignore", ".*in eval mode at the start of training.*")  # what is frozen is so on purpose
-    torch.set_float32_matmul_precision("high")
+_LOGGERS = ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero")
+_TIPS = (
+    "does not have many workers",
+    "number of training batches",
+    "exists and is not empty",
+    "isn't supported for scheduler",
+    "dirpath has changed",
+    "LeafSpec",
+    "mid-epoch",
+    "ended.*epoch",
+    "in eval mode at the start of training",  # what is frozen is so on purpose
+)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Lightning's tips and hardware lists do not belong in a log; its warnings that matter stay. Within it products of
+    matrices are as fast as their precision allows. Afterwards the process is as it was."""
+    loggers = [logging.getLogger(name) for name in _LOGGERS]
+    before, precision = [each.level for each in loggers], torch.get_float32_matmul_precision()
+    with warnings.catch_warnings():
+        for tip in _TIPS:
+            warnings.filterwarnings("ignore", f".*{tip}")
+        for each in loggers:
+            each.setLevel(logging.ERROR)
+        torch.set_float32_matmul_precision("high")
+        try:
+            yield
+        finally:
+            torch.set_float32_matmul_precision(precision)
+            for each, level in zip(loggers, before, strict=True):
+                each.setLevel(level)

@@ -24,6 +24,7 @@ from lightdepth.reporting.names import Names
 
 SEQUENCES, FAILED = "sequences", "failed"
 """Folders of an output: the run of each unit, and a record of each that failed."""
+GOES_ON = "the same command goes on"
 TRIES = 2
 """How often a unit is tried where something other than its input is at fault."""
 
@@ -53,7 +54,7 @@ class Maker:
 
     def make(self, unit: Unit, model: DepthModel) -> Ended:
         """Makes a unit, and notes it where it failed."""
-        with unheard(["lightdepth", "batch"], self.keep_names), warnings_as_sentences():
+        with unheard(["lightdepth", "batch"], GOES_ON, self.keep_names), warnings_as_sentences():
             return self._made(unit, model)
 
     def _made(self, unit: Unit, model: DepthModel) -> Ended:
@@ -94,7 +95,8 @@ def ended_before(unit: Unit, output: Path) -> Ended | None:
     record = read_record(output / SEQUENCES / unit.name)
     if record is not None and record["verb"] == "densify":
         _note_of(unit, output).unlink(missing_ok=True)  # it failed before
-        failures = record.get("failures") or []
+        listed = record.get("failures")
+        failures = [each for each in listed if isinstance(each, dict)] if isinstance(listed, list) else []
         if not failures:
             return Ended("done")
         return Ended("in part", "; ".join(f"{each.get('what')}: {each.get('reason')}" for each in failures))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -59,23 +60,34 @@ def line_of(unit: Unit, ended: Ended | None, output: Path, names: Names) -> Line
         error = "" if ended is None else for_line(names.text(ended.error))
         return Line(unit.name, "waiting" if ended is None else ended.state, frames=frames, error=error)
     record = read_record(output / SEQUENCES / unit.name) or {}
-    found = record.get("verdict") or {}
-    maps = [each for each in record.get("maps") or [] if isinstance(each, Mapping)]
-    keyframes, aligned, vertices = (sum(each.get(name) or 0 for each in maps) for name in _COUNTED)
+    found, listed = _mapping(record.get("verdict")), record.get("maps")
+    maps = [each for each in listed if isinstance(each, Mapping)] if isinstance(listed, list) else []
+    keyframes, aligned, vertices = (sum(map(int, _numbers(each.get(name) for each in maps))) for name in _COUNTED)
+    colour = found.get("colour")
     return Line(
         unit.name,
         ended.state,
-        found.get("colour"),
-        found.get("number"),
-        min((each["coverage"]["well_share"] for each in maps if each.get("coverage")), default=None),
+        colour if colour in COLOURS else None,
+        next(_numbers([found.get("number")]), None),
+        min(_numbers(_mapping(each.get("coverage")).get("well_share") for each in maps), default=None),
         len(maps),
         frames,
         keyframes,
         aligned,
         vertices,
-        record.get("seconds"),
+        next(_numbers([record.get("seconds")]), None),
         for_line(ended.error),
     )
+
+
+def _mapping(value: object) -> Mapping[str, object]:
+    """What should be one, of a run.json that anybody may have written to."""
+    return value if isinstance(value, Mapping) else {}
+
+
+def _numbers(values: Iterable[object]) -> Iterator[float]:
+    """Those that are numbers, and finite."""
+    return (v for v in values if isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v))
 
 
 def summary(lines: Sequence[Line]) -> str:

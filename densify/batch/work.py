@@ -5,14 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from densify.batch.cluster import SlurmConfig, check_cluster, submitted
 from densify.batch.folder import JOBS, begin, check_ours, in_turn
-from densify.batch.make import TRIES, Ended, Maker, clear_locks, ended_before
+from densify.batch.make import GOES_ON, TRIES, Ended, Maker, clear_locks, ended_before
 from densify.batch.planned import plan_batch
 from densify.batch.table import Line, line_of, summary, write_table
 from densify.batch.units import Unit, parsed_share, share_of
@@ -21,6 +21,7 @@ from lightdepth.command_line.dry import is_dry
 from lightdepth.command_line.outcome import is_quiet, outcome
 from lightdepth.counting import counted
 from lightdepth.errors import InputError, Interrupted
+from lightdepth.files.machine import machine_failure
 from lightdepth.files.named_inputs import real_inputs, write_inputs
 from lightdepth.files.replacing import RECORD, discard
 from lightdepth.files.writing import folders_for, our_mark
@@ -29,6 +30,9 @@ from lightdepth.ranges import COUNT, at_least, checked
 from lightdepth.reporting.names import Names, names_of
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.record import write_run_json
+
+_MOST_UNREAD = 10
+"""Sequences that cannot be read which have a line each; a manifest of a disk that is not there may have thousands."""
 
 
 @dataclass(frozen=True)
@@ -92,18 +96,29 @@ def batch_run(batch: Batch, running: Running) -> list[Line]:
         _write_names(batch)
     of = f" of {len(batch.units)}" if running.shard else ""
     _say(f"{counted(len(share), 'sequence')}{of}, {len(share) - len(todo)} of them already made")
-    try:
+    with _kept():
         ended = {unit.name: one for unit, one in _made(batch, running, todo)}
-    except Interrupted as error:
-        error.kept = "finished sequences are kept: the same command goes on"
-        raise
-    with in_turn(output):
-        lines = {unit.name: _line(unit, ended.get(unit.name), batch) for unit in batch.units}
-        clear_locks((unit for unit in share if lines[unit.name].state == "done"), output)
-        write_table(list(lines.values()), output, batch.notes)
-        _write_record(batch, list(lines.values()), start)
+        with in_turn(output):
+            lines = {unit.name: _line(unit, ended.get(unit.name), batch) for unit in batch.units}
+            clear_locks((unit for unit in share if lines[unit.name].state == "done"), output)
+            write_table(list(lines.values()), output, batch.notes)
+            _write_record(batch, list(lines.values()), start)
     _say(summary([lines[unit.name] for unit in share]))
     return [lines[unit.name] for unit in batch.units if unit.name in before]
+
+
+@contextmanager
+def _kept() -> Iterator[None]:
+    """What a signal or the machine ends within it is told with how to go on."""
+    try:
+        yield
+    except Interrupted as error:
+        error.kept = f"finished sequences are kept: {GOES_ON}"
+        raise
+    except Exception as error:
+        if (failure := machine_failure(error, kept=f"Finished sequences are kept: {GOES_ON}")) is None:
+            raise
+        raise failure from error
 
 
 def told_failures(lines: Sequence[Line]) -> list[str]:
@@ -113,6 +128,7 @@ def told_failures(lines: Sequence[Line]) -> list[str]:
 
 def _made(batch: Batch, running: Running, todo: Sequence[Unit]) -> Iterator[tuple[Unit, Ended]]:
     """What came of each unit; those whose process died are tried once more, by another one."""
+    unread = 0
     with Progress("Sequences", len(todo)) as bar:
         for tries in range(1, TRIES + 1):
             lost = []
@@ -123,9 +139,13 @@ def _made(batch: Batch, running: Running, todo: Sequence[Unit]) -> Iterator[tupl
                     continue
                 ended = batch.maker.failed(unit, str(found), tries) if isinstance(found, Lost) else found
                 bar.advance()
-                _say(f"{bar.done}/{bar.total} {_in_short(unit, ended, batch)}")
+                unread += bool(unit.trouble)
+                if not unit.trouble or unread <= _MOST_UNREAD:
+                    _say(f"{bar.done}/{bar.total} {_in_short(unit, ended, batch)}")
                 yield unit, ended
             todo = lost
+    if unread > _MOST_UNREAD:
+        _say(f"{unread - _MOST_UNREAD} more cannot be read: the table has them all")
 
 
 def _tried(batch: Batch, running: Running, todo: Sequence[Unit]) -> Iterator[tuple[Unit, Ended | Lost]]:

@@ -6,10 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-from densify.scale_file import FOLDER
+from densify.scale_file import FOLDER, scales_in
 from densify.scale_run import LengthGiven, ScaleAsked
 from densify.scaling import WALL_MM
 from lightdepth.command_line.outcome import end
+from lightdepth.errors import PartialFailure
 from lightdepth.ranges import above
 from lightdepth.reporting.run import recorded, run_folder
 
@@ -34,7 +35,8 @@ def scale(
         wall_mm: Distance of the wall, mm, in the median; scales are looked for that make it .4 to 2.5 times this. A
             larger one looks for larger scales.
         output: Folder for scale.json; left out, scale/ in the run, where `measure` finds it.
-        overwrite: Replace a folder made before (scale/ in a run is replaced without asking).
+        overwrite: Replace a folder made before (scale/ in a run is replaced without asking). Figures are replaced by
+            figures alone: where no map has one, those of before stay.
     """
     folder = output or run / FOLDER
     arguments = recorded(run=run, light=light, data=data, length=length, wall_mm=wall_mm, output=folder)
@@ -42,10 +44,13 @@ def scale(
     with run_folder(folder, "scale", arguments, overwrite or output is None) as out:
         out.hash_inputs(data=data, light=None if light is None or "=" in light else Path(light))
         found, under = asked.told()
-        for one in found.maps:
+        if not found.told and scales_in(folder):
+            reasons = "; ".join(map(str, found.maps))
+            raise PartialFailure(f"no map has a figure: {reasons}. {folder} keeps the figures that it had")
+        for one in found.maps[0 if found.told else 1 :]:  # the first reason of a failure is in the last line
             (out.log if one.mm_per_unit is not None or not found.told else out.warn)(str(one))
         found.write_file(out.folder, "map units", under, asked.length_record(length))
         out.record["maps"] = [asdict(one) for one in found.maps]
         if not found.told:
-            out.fail("the scale", f"no map has a scale; {found.maps[0]}")
+            out.fail("the scale", f"no map has a scale; {found.maps[0]}", now=False)
     end(folder, then="lightdepth measure RUN --points '[[X, Y, Z], [X, Y, Z]]'")

@@ -60,7 +60,7 @@ def _record(run: Path, data: Path | None, mm_per_unit: float | None, triangles: 
     if output.suffix != ".rrd":
         raise InputError("--rerun", f"{output} does not end in .rrd", "the Rerun viewer opens no other files")
     try:
-        from densify.viewing.recording import BEGINNING, write_recording
+        from densify.viewing.recording import BEGINNING, recorded
     except ModuleNotFoundError as error:
         raise InputError("--rerun", f"{error.name} is not installed", "pip install 'lightdepth[rerun]'") from error
     from densify.viewing.known import known_of
@@ -71,7 +71,7 @@ def _record(run: Path, data: Path | None, mm_per_unit: float | None, triangles: 
     if not (maps := watched.first()):
         raise InputError(run, "no surface yet", "begin again when the run has finished its first map")
     known = known_of(watched, data, mm_per_unit)
-    write_whole(output, lambda path: write_recording(path, maps, known))
+    write_whole(output, recorded(maps, known))
     for note in known.notes:
         outcome().last(note)
     result = {"recording": str(output), "maps": [each.name for each in maps], "unit": known.unit}

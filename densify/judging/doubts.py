@@ -13,6 +13,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from densify.agreement import MOST_AT_ONCE
 from lightdepth.hidden_uncertainty import HiddenCalibration, HiddenErrors, calibrated
 from lightdepth.prediction import DepthPrediction
 
@@ -67,6 +68,9 @@ def sigma_at(prediction: DepthPrediction, pixels: np.ndarray) -> np.ndarray | No
     """The predicted uncertainty (n,) at pixels (n, 2), bilinear; None where the model has none."""
     if prediction.uncertainty is None or not len(pixels):
         return None
+    if len(pixels) > MOST_AT_ONCE:
+        parts = [sigma_at(prediction, part) for part in (pixels[:MOST_AT_ONCE], pixels[MOST_AT_ONCE:])]
+        return np.concatenate([part for part in parts if part is not None])
     place = (pixels - 0.5).astype(np.float32)
     sampled = cv2.remap(
         prediction.uncertainty.astype(np.float32, copy=False),

@@ -52,7 +52,7 @@ def whole_run(colon: Path, output: Path, model: DepthModel, predicting: ModelSou
         merging=MergeConfig(),
     )
     start, used = time.perf_counter(), time.process_time()
-    with unheard(["lightdepth", "bench", "speed"]):
+    with unheard(["lightdepth", "bench", "speed"], ""):
         dense_run(asked, model, output)
     seconds, processor = time.perf_counter() - start, time.process_time() - used
     (made,) = read_json(output / "run.json")["maps"]

@@ -3,13 +3,14 @@
 `/MAP/surface/COLOUR` is a mesh, `/MAP/points/KIND` a cloud, `/MAP/camera` a keyframe's place, with its image, at the
 number of its frame on the timeline `frame`, where `/MAP/predicted` has the row of pictures that `densify` wrote.
 Coordinates are the map's (x right, y down, z ahead, of its first camera). A lens is drawn as a pinhole of its field.
+It is made in memory, two and a half times its size: the package's own writer waits without end where the disk is full.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 import rerun as rr
@@ -19,6 +20,7 @@ from densify.trust import vertex_normals
 from densify.viewing.known import Known
 from densify.viewing.places import LEFT_OUT, PATH, USED, centers, extent, vertex_colors
 from densify.viewing.watched import ViewedMap
+from lightdepth.errors import InputError
 from lightdepth.foreign_text import for_terminal
 from lightdepth.reporting.figures import jpeg
 from lightdepth.reporting.progress import Progress
@@ -26,23 +28,31 @@ from lightdepth.reporting.progress import Progress
 BEGINNING = "RRF2"
 """How such a file begins."""
 TIMELINE = "frame"
+_OFF = ("0", "false", "off", "no")
+"""What the package takes for a switch in the variable RERUN."""
 
 
-def write_recording(path: Path, maps: Sequence[ViewedMap], known: Known) -> None:
-    """Writes the file."""
+def recorded(maps: Sequence[ViewedMap], known: Known) -> bytes:
+    """The file. Raises InputError where the package is switched off."""
+    if os.environ.get("RERUN", "").lower() in _OFF:
+        raise InputError("RERUN", "the environment switches the package off by it", "take it out of the environment")
     recording = rr.RecordingStream("lightdepth", send_properties=False)
-    recording.send_recording_name("a run of lightdepth")
-    recording.set_log_time_enabled(False)
-    recording.set_log_tick_enabled(False)
-    recording.save(path, default_blueprint=rrb.Blueprint(rrb.Tabs(*map(_tab, maps)), collapse_panels=False))
+    stream = rr.binary_stream(recording)
     try:
+        recording.send_recording_name("a run of lightdepth")
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+        first = rrb.Blueprint(rrb.Tabs(*map(_tab, maps)), collapse_panels=False)
+        recording.send_blueprint(first, make_active=False, make_default=True)
         with Progress("Recording", sum(len(viewed.surface.poses) for viewed in maps)) as bar:
             for viewed in maps:
                 _log_map(recording, viewed, known)
                 for _ in _log_keyframes(recording, viewed, known):
                     bar.advance()
+        made: bytes | None = stream.read()
+        assert made, "nothing was recorded"
+        return made
     finally:
-        recording.flush()
         recording.disconnect()
 
 

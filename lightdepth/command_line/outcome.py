@@ -15,9 +15,10 @@ import ctypes
 import json
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,6 +63,8 @@ class Outcome:
     finished_before: bool = False
     stage: Callable[[str], None] = lambda said: None
     """is told the lines of a log"""
+    goes_on: str = "--resume goes on"
+    """how a run whose finished parts are kept goes on, in words; empty where none does"""
     record: Mapping[str, Any] | None = None
     """the last run.json that was written, of a folder that may not be in its place yet"""
 
@@ -166,7 +169,13 @@ def manners(words: Sequence[str]) -> tuple[Outcome, list[str]]:
     return Outcome(QUIET in words and working, JSON in words and not asked, rest[0] if rest else ""), rest
 
 
+_TURN = threading.RLock()
 _SPELLED = {word.replace("-", "_") for word in _ANSWERED}
+
+
+def in_turn(call: Outcome) -> AbstractContextManager[object]:
+    """Standard output is one for all threads of a process: calls that keep it for their answers wait for each other."""
+    return _TURN if call.json or call.quiet else nullcontext()
 
 
 @contextmanager

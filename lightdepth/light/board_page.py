@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lightdepth.light.fit_on_board import BoardFit
+from lightdepth.light.fit_on_board import BoardFit, lens_said
 from lightdepth.reporting.figures import chart, chart_png
 from lightdepth.reporting.report import Report
 
@@ -48,6 +48,8 @@ def board_page(found: BoardFit, what: str) -> Report:
             ["stray light, as a share of the lamps' own", lamps.stray],
         ],
     )
+    if said := lens_said(found.lens_mu):
+        page.text(f"The lens's own mu is {found.lens_mu:.2f}{said}.")
     page.heading("Frames kept from the fit")
     page.table(
         ["lamps", "what they leave (median, in deviations of the noise)"],

@@ -108,12 +108,22 @@ class BoardFit:
         place = ", ".join(
             f"{axis} {at:.2f} ± {wide:.2f}" for axis, at, wide in zip("xyz", lamps.middle, self.half_width, strict=True)
         )
+        lens = f"{self.lens_mu:.2f}{lens_said(self.lens_mu)}"
         many = "" if len(lamps.shares) == 1 else f" (the middle of {len(lamps.shares)} lamps)"
         return (
             f"at {place} mm{many}, nine of ten times; gamma {lamps.gamma:.2f}, mu {self.light.mu:.2f}, of which the "
-            f"lens {self.lens_mu:.2f}; {len(self.whites)} of {self.looked_at} frames, of whose white {self.left:.1%} "
-            "is left over"
+            f"lens {lens}; {len(self.whites)} of {self.looked_at} frames, of whose white {self.left:.1%} is left over"
         )
+
+
+def lens_said(lens_mu: float) -> str:
+    """What a lens is that darkens by less than nothing to its side, in brackets; empty for others."""
+    if round(lens_mu, 2) >= 0:
+        return ""
+    return (
+        " (below 0: images are brighter at the edge than the light alone makes them, as where the endoscope evens "
+        "out its lens)"
+    )
 
 
 def fit_on_board(

@@ -159,10 +159,11 @@ class Run:
         with (self.folder / "log.txt").open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{time.strftime('%H:%M:%S')} {shown(message)}\n")
 
-    def fail(self, what: str, reason: str) -> None:
-        """Part of the work failed; the rest goes on (exit code 4 at the end)."""
+    def fail(self, what: str, reason: str, now: bool = True) -> None:
+        """Part of the work failed; the rest goes on (exit code 4 at the end). Not `now`: the last line tells it."""
         self.record["failures"].append({"what": what, "reason": reason})
-        self._tell(f"failed: {what}: {reason}", for_line, outcome().doubts)
+        said = f"failed: {what}: {reason}"
+        self._tell(said, for_line, outcome().doubts) if now else self._note(said)
 
     def warn(self, message: str) -> None:
         """Something is doubtful; the work goes on. It is in the log and in run.json."""
@@ -384,10 +385,9 @@ def kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
         yield
     except BaseException as error:
         kept = bool(resumable and run.parts and not isinstance(error, InputError))
-        said = f"{kept_parts(run.parts or {})}: --resume goes on" if kept else ""
-        failure = machine_failure(
-            error, run.folder, said or f"Nothing of it is kept; {output.name} is as it was", output
-        )
+        said = f"{kept_parts(run.parts or {})}: {how}" if (how := outcome().goes_on) and kept else ""
+        none = f"Nothing of it is kept; {output.name} is as it was" if how else ""
+        failure = machine_failure(error, run.folder, said or none, output)
         if not kept:
             with finishing_first():
                 discard(run.folder)

@@ -24,6 +24,7 @@ from lightdepth.reporting.figures import MeshView, webp
 _STEPS = 65535  # of a place along an axis, from one end of the surface to the other
 _TOGETHER = 250_000  # triangles of all surfaces
 _FEWEST = 4_000  # of each, however many there are
+_POINTS, _FEWEST_POINTS = 200_000, 1_000  # the same of points
 _ROUGHLY = 10  # times the triangles that are wanted: a larger mesh is thinned out quickly first
 
 
@@ -132,7 +133,9 @@ class Scene:
         if not shown:
             return None
         still = MeshView.of(shown[0].vertices, shown[0].triangles).cutout(shown[0].layers[0].colors())
-        return cls(shown, webp(still), pictures, kinds, max(min(cls.most, _TOGETHER // len(shown)), _FEWEST))
+        most = max(min(cls.most, _TOGETHER // len(shown)), _FEWEST)
+        points = max(min(cls.most_points, _POINTS // len(shown)), _FEWEST_POINTS)
+        return cls(shown, webp(still), pictures, kinds, most, points)
 
     def text(self) -> str:
         """The JSON, which ends no element of HTML that it stands in."""

@@ -144,8 +144,8 @@ def _ablate(
     todo = [plan for plan in plans if finished(plan) is None]
     say(f"{counted(len(plans), 'training')}, {len(plans) - len(todo)} of them already there")
     if todo:
-        quiet()
-        train_all(parser, todo, Judge(judged, common.tube, common.size))
+        with quiet():
+            train_all(parser, todo, Judge(judged, common.tube, common.size))
     results = [finished(plan) for plan in plans]
     made = AblationTable(
         title=base.stem,

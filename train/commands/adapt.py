@@ -97,8 +97,7 @@ def adapt(
     start = load_called(checkpoint, details=False)
     if not isinstance(start, NetworkModel):
         raise InputError("--checkpoint", f"{checkpoint} has no weights to adapt", "expected a trained checkpoint")
-    quiet()
-    with run_folder(output, "adapt", arguments, overwrite, resume) as run:
+    with quiet(), run_folder(output, "adapt", arguments, overwrite, resume) as run:
         run.hash_inputs(**source.files, map=map, checkpoint=Path(checkpoint))
         target = read_target(run, source, map, fit_light, config, start, sfm, pairing, more)
         size = config.size or working_size(target.frames.first().camera, start.rows)
