@@ -9,8 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from colons import sequence, truth
 from raising import refused
 from scenes import cylinder, sphere
+from test_live import fed, setting
 from test_tiny_fusion import VOXEL, looks, predicted
 from volumes import by_warp, needs_warp, sums
 
@@ -24,6 +26,7 @@ from densify.fusion.patches import BlockSurface, joined
 from densify.fusion.rectify import RectifyConfig, SurfaceView, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
 from densify.live.densifier import Densifier
+from densify.pipeline import densify_submap
 from lightdepth import native
 from lightdepth.camera import KannalaBrandt, Pinhole
 from lightdepth.models import DeclineModel, NetworkModel
@@ -245,6 +248,23 @@ def test_surfaces_are_fused_where_the_network_runs(monkeypatch):
     monkeypatch.setattr(type(network), "device", torch.device("cuda", 1))
     FullFuser(1.0, DensifyConfig(), device_of(network))
     assert asked == ["cuda:1"] and Densifier(network, LiveConfig())._device == "cuda:1"
+
+
+def test_a_submap_is_made_dense_and_grows_live_alike_wherever_it_is_fused(gpu, monkeypatch):
+    frames, found, config = setting(count=3)
+    (submap,) = found.map.submaps
+    made, kinds = [], []
+    for device in ("cpu", gpu):
+        for place in ("densify.fusers", "densify.live.densifier"):
+            monkeypatch.setattr(f"{place}.device_of", lambda model, device=device: device)
+        dense = densify_submap(submap, sequence(frames), truth, config).dense
+        live = fed(Densifier(truth, config, submap.id), frames, submap)
+        kinds.append(type(live._volume))
+        numbers = (dense.vertices, dense.triangles, dense.colors, dense.weights, dense.views, dense.expected_error)
+        made.append([*numbers, *live.mesh().joined()])
+    assert kinds == [TsdfVolume, DeviceVolume] and len(made[0][0]) > 500 < len(made[0][6])
+    for one, other in zip(*made, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_without_the_library_the_message_says_what_to_install(monkeypatch):
