@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from densify.alignment import Alignment
-from densify.fusion.volume import TsdfVolume
+from densify.fusion.chosen import Volume
 from lightdepth import native
 from lightdepth.brief import Brief
 from lightdepth.calibration import read_camera, write_camera
@@ -122,7 +122,7 @@ class DenseMap(Brief):
     than fusion.max_error; None where nothing was left out by that"""
 
     @classmethod
-    def of(cls, volume: TsdfVolume, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
+    def of(cls, volume: Volume, submap: Submap, alignments: tuple[Alignment, ...]) -> DenseMap:
         """The surface in a volume, as it is now."""
         m = volume.extract_mesh()
         surface = (m.vertices, m.triangles, m.colors)

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from densify.fusion.chosen import unlike
 from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth import native
 from lightdepth.camera import Pinhole
-from lightdepth.compiled import cache_folder, open_to_others
+from lightdepth.compiled import cache_folder
 from lightdepth.errors import InputError
 from lightdepth.files.lock import locked
 from lightdepth.files.replacing import hidden, output_of, recover, remains
@@ -37,8 +38,8 @@ def examine() -> list[Check]:
     needed = ("torch", "lightning", "kornia", "numpy", "scipy", "pycolmap", "opencv-python-headless")
     findings = [Check("python", True, f"{found['python']} on {platform.machine()}, {os.cpu_count()} cores")]
     findings += [Check(name, name in found, found.get(name, f"missing: pip install {name}")) for name in needed]
-    findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), _machine_code(), _torchvision()]
-    findings += [_remains(Path())]
+    findings += [_open3d(found), _torch_device(), _pycolmap(), _fused_plane(), *_fused_on_gpu(), _machine_code()]
+    findings += [_torchvision(), _remains(Path())]
     return findings
 
 
@@ -58,7 +59,8 @@ def _torch_device() -> Check:
     import torch
 
     if torch.cuda.is_available():
-        note = "" if native.has_warp() else "; synthetic colons are rendered on the CPU: pip install 'lightdepth[gpu]'"
+        without = "; colons are rendered and surfaces fused on the CPU: pip install 'lightdepth[gpu]'"
+        note = "" if native.has_warp() else without
         return Check("device", True, f"cuda: {torch.cuda.get_device_name(0)}{note}")
     return Check(
         "device", True, f"cpu, {torch.get_num_threads()} threads (a GPU is used where there is one, never needed)"
@@ -101,7 +103,7 @@ def _machine_code() -> Check:
     folder = cache_folder()
     if folder is None:
         return Check("compiled loops", True, "made by each process: there is no home to keep them in")
-    if open_to_others(folder):
+    if native.open_to_others(folder):
         cure = f"what is in it is run: remove it, or chmod 700 {folder} once you know what it holds"
         return Check("compiled loops", False, f"{folder} is another user's, or others may write to it; {cure}")
     return Check("compiled loops", True, f"kept in {folder}")
@@ -129,6 +131,17 @@ def fused_plane_error(voxel: float = 0.5, distance: float = 30.0) -> tuple[int, 
     vertices = volume.extract_mesh().vertices
     error = float(np.abs(vertices[:, 2] - distance).max() / voxel) if len(vertices) else np.inf
     return len(vertices), error
+
+
+def _fused_on_gpu() -> list[Check]:
+    """Nothing where no surface would be fused on a GPU."""
+    import torch
+
+    if not torch.cuda.is_available() or not native.has_warp():
+        return []
+    wrong = unlike("cuda:0")
+    what = f"{wrong}; surfaces are fused on the CPU" if wrong else "bit for bit as on the CPU"
+    return [Check("fused on the GPU", not wrong, what)]
 
 
 def _fused_plane() -> Check:

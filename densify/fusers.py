@@ -15,11 +15,13 @@ from densify.contradiction import share_at
 from densify.coverage import Given, with_contributions
 from densify.dense_map import DenseMap
 from densify.expected import expected_share
+from densify.fusion.chosen import volume_on
 from densify.fusion.plain import PlainTsdf, undistorted
 from densify.fusion.rectify import SurfaceView, surface_view
-from densify.fusion.volume import FusionConfig, TsdfVolume
+from densify.fusion.volume import FusionConfig
 from densify.judging.images import Seen
-from densify.predictions import SeenKeyframe
+from densify.predictions import Predictor, SeenKeyframe
+from lightdepth.models import NetworkModel
 from lightdepth.prediction import DepthPrediction
 from lightdepth.sparse_map import Submap
 
@@ -34,10 +36,15 @@ class Fuser(Protocol):
         """The surface as it is now; `seen` is what the keyframes' images tell of distances, by name."""
 
 
-def fuser_for(submap: Submap, config: DensifyConfig) -> Fuser:
-    """An empty surface of the recipe, with voxels that suit the submap."""
+def fuser_for(submap: Submap, config: DensifyConfig, model: Predictor) -> Fuser:
+    """An empty surface of the recipe, with voxels that suit the submap, on the device that the model runs on."""
     voxel = config.fusion.voxel_for(submap)
-    return PaperFuser(voxel, config) if config.recipe == "paper" else FullFuser(voxel, config)
+    return PaperFuser(voxel, config) if config.recipe == "paper" else FullFuser(voxel, config, device_of(model))
+
+
+def device_of(model: Predictor) -> str:
+    """Where surfaces are fused: where the model's network runs; on the processor without one."""
+    return str(model.device) if isinstance(model, NetworkModel) else "cpu"
 
 
 def view_to_fuse(
@@ -72,10 +79,10 @@ def _rectified(
 
 
 class FullFuser:
-    """Rectified wide-angle views into a weighted volume. `voxel` in map units."""
+    """Rectified wide-angle views into a weighted volume on a device, as PyTorch names it. `voxel` in map units."""
 
-    def __init__(self, voxel: float, config: DensifyConfig) -> None:
-        self._config, self._volume = config, TsdfVolume(voxel, config.fusion)
+    def __init__(self, voxel: float, config: DensifyConfig, device: str = "cpu") -> None:
+        self._config, self._volume = config, volume_on(device, voxel, config.fusion)
         self._given: dict[str, Given] = {}
         self._unsure: dict[str, float] = {}
 

@@ -115,7 +115,8 @@ class DenseModel:
     judged."""
     device: Device = "auto"
     """What the network of --checkpoint runs on: auto, a CUDA GPU where there is one, else the processor; cpu, the
-    processor; cuda; or mps, the GPU of an Apple computer."""
+    processor; cuda; or mps, the GPU of an Apple computer. On a CUDA GPU, surfaces are fused there too if NVIDIA Warp is
+    installed (extra gpu)."""
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ def densify_submap(
     nearer keyframes contradict is left out. What remains is fused into one surface, and judged. Raises InputError where
     no keyframe observes a point.
     """
-    clock, fuser = Clock(), fuser_for(submap, config)
+    clock, fuser = Clock(), fuser_for(submap, config, model)
     judge, shared = Judge(submap, config), covisibility(submap)
     predictions = Predictions(frames, model, config.keep_mb, clock)
     keyframes, doubts = [], {}

@@ -80,7 +80,8 @@ class ModelSource:
     equally far, to compare with)."""
     device: Device = "auto"
     """What the network runs on: auto, a CUDA GPU where there is one, else the processor; cpu, the processor; cuda; or
-    mps, the GPU of an Apple computer."""
+    mps, the GPU of an Apple computer. Where the network runs on a CUDA GPU, surfaces are fused there too if NVIDIA Warp
+    is installed (extra gpu), else on the processor."""
 
     def load(self, details: bool = True) -> DepthModel:
         """The model, as `load_called` gives it."""

@@ -13,9 +13,7 @@ else may write to, and what is damaged there is thrown away and made anew.
 from __future__ import annotations
 
 import hashlib
-import os
 import pickle
-import stat
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -30,6 +28,8 @@ from numba.core.caching import (
     UserProvidedCacheLocator,
     UserWideCacheLocator,
 )
+
+from lightdepth.native import open_to_others, user_cache
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -49,19 +49,8 @@ def cache_folder() -> Path | None:
     given = numba.config.CACHE_DIR  # set at run time
     if given:
         return Path(given)
-    try:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError:  # a user without a home
-        return None
-    return Path(home) / "lightdepth" / "compiled"
-
-
-def open_to_others(folder: Path) -> bool:
-    """Whether somebody else could put something into a folder, or owns it."""
-    if os.name == "nt" or not folder.exists():
-        return False
-    found = folder.stat()
-    return found.st_uid not in (os.getuid(), 0) or bool(found.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+    home = user_cache()
+    return None if home is None else home / "compiled"
 
 
 class _Own(UserWideCacheLocator):

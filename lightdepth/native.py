@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import os
+import shutil
+import stat
+import tempfile
+from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 from lightdepth.errors import InputError
@@ -66,6 +72,38 @@ def pycolmap() -> ModuleType:
     return pycolmap
 
 
+def open_to_others(folder: Path) -> bool:
+    """Whether somebody else could put something into a folder, or owns it."""
+    if os.name == "nt" or not folder.exists():
+        return False
+    found = folder.stat()
+    return found.st_uid not in (os.getuid(), 0) or bool(found.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+
+
+def user_cache() -> Path | None:
+    """Where what is made once for a user is kept; None for a user without a home."""
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    return Path(home) / "lightdepth"
+
+
+def _kept_in() -> Path:
+    """The folder for what Warp compiles and then runs: the user's own, where nobody else may write to it; else one that
+    goes with the process."""
+    home = user_cache()
+    with suppress(OSError):
+        if home is not None:
+            folder = home / "warp"
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK) and not open_to_others(folder):
+                return folder
+    passing = tempfile.mkdtemp(prefix="lightdepth-warp-")
+    atexit.register(shutil.rmtree, passing, ignore_errors=True)
+    return Path(passing)
+
+
 def has_warp() -> bool:
     """Whether NVIDIA Warp is installed (extra [gpu])."""
     return find_spec("warp") is not None
@@ -78,10 +116,12 @@ def warp() -> ModuleType:
         import warp
     except ImportError as error:
         raise InputError(
-            "NVIDIA Warp, which casts rays on a GPU",
+            "NVIDIA Warp, which casts rays and fuses surfaces on a GPU",
             f"it cannot be loaded ({error})",
-            "install it: pip install 'lightdepth[gpu]'; or render on the CPU",
+            "install it: pip install 'lightdepth[gpu]'; or stay on the CPU (--device cpu)",
         ) from error
+    if "WARP_CACHE_PATH" not in os.environ:
+        warp.config.kernel_cache_dir = str(_kept_in())
     warp.config.log_level = warp.LOG_ERROR  # or it greets, and warns where there is no GPU
     warp.init()  # type: ignore[no-untyped-call]  # Warp has no annotation for it
     return warp

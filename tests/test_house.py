@@ -44,7 +44,9 @@ def parameters(function: Function) -> list[str]:
 
 
 def compiled(function: Function) -> bool:
-    return any("compiled" in ast.unparse(decorator) for decorator in function.decorator_list)
+    """By Numba, or as a kernel of Warp: either takes arrays and numbers, and no record of them."""
+    decorators = [ast.unparse(decorator) for decorator in function.decorator_list]
+    return any("compiled" in each or each.startswith("wp.kernel") for each in decorators)
 
 
 def verbs() -> Iterator[tuple[str, Callable[..., Any]]]:

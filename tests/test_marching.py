@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from colons import colon, slam, truth
+from volumes import on_both, sums
 
 from densify.fusion.marching_cubes import CORNERS, packed, unpacked
 from densify.fusion.patches import BlockSurface, joined
@@ -14,6 +15,8 @@ from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth.camera import Pinhole
 from lightdepth.prediction import DepthPrediction
+
+kind = on_both(__name__)
 
 
 def whole(volume: TsdfVolume) -> BlockSurface:
@@ -44,7 +47,7 @@ def views():
 
 
 @pytest.fixture(scope="module")
-def fused() -> TsdfVolume:
+def fused(kind) -> TsdfVolume:
     volume = TsdfVolume(views()[1], FusionConfig())
     for view, pose in views()[0]:
         volume.integrate(view, pose)
@@ -135,13 +138,14 @@ def test_only_blocks_beside_a_change_are_made_again():
 def test_the_blocks_below_a_change_are_among_those_that_may_have_changed():
     volume = TsdfVolume(0.4, FusionConfig())
     volume.integrate(plane(), np.eye(4))
-    before = {code: sums(volume, code) for code in volume.places.tolist()}
+    before = distances(volume)
     told = set(volume.integrate(plane(first=105), np.eye(4)).tolist())
-    after = {code: sums(volume, code) for code in volume.places.tolist()}
+    after = distances(volume)
     changed = [code for code in after if not np.array_equal(before.get(code), after[code])]
     below = packed((unpacked(np.array(changed))[:, None] - CORNERS).reshape(-1, 3))
     assert changed and told >= set(below.tolist()) & after.keys() and len(told) < 0.5 * len(after)
 
 
-def sums(volume: TsdfVolume, code: int) -> np.ndarray:
-    return volume._distance[volume.slots(np.array([code]))[0]].copy()
+def distances(volume: TsdfVolume) -> dict[int, np.ndarray]:
+    """Sums of distances of each block, by its packed place."""
+    return dict(zip(volume.places.tolist(), sums(volume)["distance"].copy(), strict=True))

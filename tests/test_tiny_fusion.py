@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 from raising import refused
-from test_fusion import by_hand, shifted, sums
+from test_fusion import by_hand, shifted
+from volumes import on_both, sums, sums_at
 
 from densify.fusion.marching_cubes import CORNERS, REACH, packed, unpacked
 from densify.fusion.patches import BlockSurface, joined
@@ -20,6 +21,8 @@ from lightdepth.sparse_map import Keyframe, Submap, typical_distance
 
 CAMERA = Pinhole(14, 11, 14.0, 15.0, 6.2, 5.9)
 VOXEL = 0.16
+Loops = TsdfVolume
+kind = on_both(__name__)
 
 
 def predicted(distance: np.ndarray, valid: np.ndarray | None = None, camera: CameraModel = CAMERA) -> DepthPrediction:
@@ -79,14 +82,14 @@ def test_a_view_opens_the_blocks_along_its_rays_and_holds_those_it_says_somethin
     volume = TsdfVolume(VOXEL, FusionConfig())
     changed = volume.integrate(view, pose)
     opened = blocks_of(view, pose)
-    said = by_hand(view, pose, VOXEL, unpacked(opened))["_seen"].any(1)
+    said = by_hand(view, pose, VOXEL, unpacked(opened))["seen"].any(1)
     assert np.array_equal(volume.places, opened[said]) and len(volume.places) > 5
     assert np.isin(opened, changed).all()
     for name, expected in by_hand(view, pose, VOXEL, unpacked(volume.places)).items():
         off = np.abs(sums(volume)[name] - expected)
-        assert off.max() <= (1 if name != "_distance" else 4 * FULL) and (off > 0).mean() < 2e-3, name
-    signs = np.packbits(sums(volume)["_weight"] > 0, axis=1, bitorder="little")
-    assert np.array_equal(sums(volume)["_known"], signs)
+        assert off.max() <= (1 if name != "distance" else 4 * FULL) and (off > 0).mean() < 2e-3, name
+    signs = np.packbits(sums(volume)["weight"] > 0, axis=1, bitorder="little")
+    assert np.array_equal(sums(volume)["known"], signs)
 
 
 def test_sums_of_two_views_are_the_sums_of_their_sums_and_one_taken_out_leaves_the_other():
@@ -94,7 +97,7 @@ def test_sums_of_two_views_are_the_sums_of_their_sums_and_one_taken_out_leaves_t
     parts = [TsdfVolume(VOXEL, FusionConfig()) for _ in looks()]
     for part, look in zip(parts, looks(), strict=True):
         part.integrate(*look)
-    together: dict[str, dict[int, np.ndarray]] = {"_weight": {}, "_distance": {}, "_seen": {}, "_color": {}}
+    together: dict[str, dict[int, np.ndarray]] = {"weight": {}, "distance": {}, "seen": {}, "color": {}}
     for part in parts:
         for name, values in together.items():
             for code, value in zip(part.places.tolist(), sums(part)[name], strict=True):
@@ -111,12 +114,12 @@ def test_sums_of_two_views_are_the_sums_of_their_sums_and_one_taken_out_leaves_t
 def test_a_voxel_is_known_once_enough_views_have_seen_it():
     volume = fused(min_views=2)
     held = sums(volume)
-    assert np.array_equal(held["_known"], np.packbits(held["_seen"] >= 2, axis=1, bitorder="little"))
-    assert 0 < (held["_seen"] >= 2).sum() < (held["_seen"] >= 1).sum()
+    assert np.array_equal(held["known"], np.packbits(held["seen"] >= 2, axis=1, bitorder="little"))
+    assert 0 < (held["seen"] >= 2).sum() < (held["seen"] >= 1).sum()
 
 
 def test_a_volume_that_outgrows_its_memory_keeps_what_it_holds_and_who_is_beside_whom():
-    volume, places = TsdfVolume(VOXEL), np.stack(np.meshgrid(*[np.arange(-4, 4)] * 3), -1).reshape(-1, 3)
+    volume, places = Loops(VOXEL), np.stack(np.meshgrid(*[np.arange(-4, 4)] * 3), -1).reshape(-1, 3)
     codes = np.random.default_rng(0).permutation(packed(places))
     first = volume._hold(codes[:200])
     volume._weight[first] = np.arange(200)[:, None]
@@ -141,7 +144,7 @@ def test_a_view_that_knows_nothing_changes_nothing_and_no_volume_is_too_fine():
         surface_view(predicted(slanted(), np.zeros((11, 14), bool)), colours(), RectifyConfig()),
     )
     assert volume.integrate(blind, np.eye(4)).shape == (0,) and volume.views == 0
-    assert volume._touched(blind, np.eye(4)).shape == (0, 3) and not len(volume.places)
+    assert Loops(VOXEL)._touched(blind, np.eye(4)).shape == (0, 3) and not len(volume.places)
     mesh = volume.extract_mesh()
     assert mesh.vertices.shape == mesh.triangles.shape == (0, 3)
     for voxel in (0.0, -1.0, np.nan, np.inf):
@@ -174,14 +177,15 @@ def test_vertices_lie_on_the_wall_with_the_colours_weights_and_views_of_the_voxe
     mesh = volume.extract_mesh()
     off = mesh.vertices @ np.array([0.25, -0.35, 0.9]) - 2.0
     assert len(mesh.vertices) > 50 and np.abs(off).max() < 0.02 * VOXEL and mesh.views.tolist() == [1] * len(off)
-    found, weight = volume.cut(volume.slots(volume.places)), volume._weight.reshape(-1)
+    found = volume.cut(volume.slots(volume.places))
     order = np.argsort(found.names)
     names, first = np.unique(found.names, return_index=True)
     assert len(names) == len(mesh.vertices) and len(order) > len(first)
     near, far, share = found.near[first], found.far[first], found.share[first]
-    np.testing.assert_allclose(mesh.weights, (weight[near] * (1 - share) + weight[far] * share) / 255)
-    color = volume._color.reshape(-1, 4) * 1.0
-    mean = color[near] * (1 - share)[:, None] + color[far] * share[:, None]
+    one, two = (sums_at(volume, "weight", voxels) for voxels in (near, far))
+    np.testing.assert_allclose(mesh.weights, (one * (1 - share) + two * share) / 255)
+    one, two = (sums_at(volume, "color", voxels) for voxels in (near, far))
+    mean = one * (1 - share)[:, None] + two * share[:, None]
     np.testing.assert_allclose(mesh.colors, mean[:, :3] / mean[:, 3:] / 255, atol=1e-6)
     assert mesh.colors.min() > 0.05 and mesh.colors.max() < 0.95
 

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 from test_fusion import shifted
 from test_tiny_fusion import VOXEL, fused, looks, predicted
+from volumes import on_both, sums
 
 from densify.fusion.marching_cubes import REACH, one_vertex_an_edge, packed, unpacked
 from densify.fusion.patches import BlockSurface, joined
+from densify.fusion.posed import block_origins, voxel_offsets
 from densify.fusion.rectify import RectifyConfig, surface_view
 from densify.fusion.volume import FusionConfig, TsdfVolume
 from lightdepth.camera import Pinhole
+
+kind = on_both(__name__, "test_tiny_fusion")
 
 
 def test_a_direction_is_that_of_the_sum_of_its_two_parts():
@@ -69,14 +73,14 @@ def test_the_truncation_is_how_far_behind_the_wall_a_voxel_is_known(truncation):
     view, pose = looks()[0]
     volume = TsdfVolume(VOXEL, FusionConfig(truncation=truncation))
     volume.integrate(view, shifted() @ pose)
-    slots = volume.slots(volume.places)
     inner = np.stack(np.unravel_index(np.arange(512), (8, 8, 8)), -1)
     points = (8 * unpacked(volume.places)[:, None] + inner) * VOXEL
     behind = points @ np.array([0.25, -0.35, 0.9]) - 2.0
-    known = volume._weight[slots] > 0
+    held = sums(volume)
+    known = held["weight"] > 0
     size = np.linalg.norm([0.25, -0.35, 0.9])
     assert behind[known].max() / size < truncation * VOXEL < behind[known].max() / size + 0.6 * VOXEL
-    share = volume._distance[slots][known] / volume._weight[slots][known] / 2048
+    share = held["distance"][known] / held["weight"][known] / 2048
     expected = np.clip(-behind[known] / size / (truncation * VOXEL), -1, 1)
     assert np.abs(share - expected).max() < 2e-3
 
@@ -134,3 +138,17 @@ def test_colours_end_at_black_and_at_white():
     camera = Pinhole(12, 8, 30.0, 30.0, 6.0, 4.0)
     view = surface_view(predicted(3 / camera.rays()[0][..., 2], camera=camera), image, RectifyConfig())
     assert view.colors[:4, 0].tolist() == [0, 255, 0, 128]
+
+
+def test_places_in_camera_axes_are_added_up_in_one_order_and_rounded_after_each_step():
+    """As a library of matrices need not do, which may fuse a product into a sum on one processor and not on another."""
+    pose, places = looks()[1][1], np.random.default_rng(0).integers(-900, 900, (200, 3))
+    offsets, origins = voxel_offsets(0.37, pose), block_origins(places, 8 * 0.37, pose)
+    assert offsets.dtype == origins.dtype == np.float32
+    for v, inner in enumerate(np.ndindex(8, 8, 8)):
+        x, y, z = (np.float32(n * 0.37) for n in inner)
+        rows = pose[:3, :3].astype(np.float32)
+        assert [r[0] * x + r[1] * y + r[2] * z for r in rows] == offsets[:, v].tolist(), inner
+    for place, origin in zip(places.tolist(), origins, strict=True):
+        x, y, z = (n * (8 * 0.37) for n in place)
+        assert [np.float32(a * x + b * y + c * z + t) for a, b, c, t in pose[:3].tolist()] == origin.tolist()

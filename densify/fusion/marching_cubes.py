@@ -138,11 +138,11 @@ def cut(
     is known; no cell with an unknown corner has any surface. above (n, 8) says where a block's neighbours at CORNERS
     are held, -1 for none; codes (n,) its packed place.
     """
-    return Cut(*_cut(distance, weight, behind, known, above, codes, slots, *_cases()))
+    return Cut(*_cut(distance, weight, behind, known, above, codes, slots, *corners_of_cases()))
 
 
 @cache
-def _cases() -> tuple[np.ndarray, np.ndarray]:
+def corners_of_cases() -> tuple[np.ndarray, np.ndarray]:
     """For each case the corners of its triangles (256, 15), as edges counted from the cell's lowest voxel in a block
     with its border: axis, then x, y, z of the edge's lower voxel. And how many corners there are (256,)."""
     table, counts = triangle_table()

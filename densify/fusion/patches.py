@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from densify.fusion.chosen import Volume
 from densify.fusion.marching_cubes import one_vertex_an_edge
-from densify.fusion.volume import TsdfVolume
 from lightdepth.compiled import compiled
 
 
@@ -53,8 +53,8 @@ class BlockSurface:
         """Packed places (n,) of the blocks that have a patch."""
         return np.fromiter(self.patches, np.int64, len(self.patches))
 
-    def renew(self, volume: TsdfVolume, changed: np.ndarray) -> None:
-        """Makes the patches of blocks (n,), packed, anew: those that TsdfVolume says may have changed."""
+    def renew(self, volume: Volume, changed: np.ndarray) -> None:
+        """Makes the patches of blocks (n,), packed, anew: those that its `integrate` says may have changed."""
         self.renewed = np.unique(changed)
         for code in self.renewed.tolist():
             self.patches.pop(code, None)

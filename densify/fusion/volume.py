@@ -16,7 +16,8 @@ from typing import Annotated
 
 import numpy as np
 
-from densify.fusion.marching_cubes import BLOCK, CORNERS, REACH, Cut, cut, one_vertex_an_edge, packed
+from densify.fusion.marching_cubes import BLOCK, CORNERS, Cut, cut, one_vertex_an_edge, packed
+from densify.fusion.posed import block_origins, check_reach, into_blocks, seeds, voxel_offsets
 from densify.fusion.rectify import FULL, SurfaceView
 from densify.fusion.second_core import halves
 from lightdepth.compiled import compiled
@@ -26,8 +27,8 @@ from lightdepth.sparse_map import Submap, typical_distance
 
 STEPS = 2048
 """Steps of s / tau on either side of 0; a sum holds 4096 views of full weight."""
-_COLORED = 2.0  # voxels from the surface that colour is kept for
-_SPARSE = 4  # every so many pixels are enough to find the blocks
+COLORED = 2.0
+"""Voxels from the surface that colour is kept for."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,13 @@ class Mesh:
     views: np.ndarray
 
 
+def checked_voxel(voxel: float) -> float:
+    """Itself. Raises InputError where a voxel has no size."""
+    if not np.isfinite(voxel) or voxel <= 0:
+        raise InputError("voxel size", f"{voxel}", "expected a positive length in map units")
+    return voxel
+
+
 class TsdfVolume:
     """A truncated signed distance volume that grows where surface is seen. `voxel` in map units.
 
@@ -86,9 +94,7 @@ class TsdfVolume:
     """
 
     def __init__(self, voxel: float, config: FusionConfig = FusionConfig()):
-        if not np.isfinite(voxel) or voxel <= 0:
-            raise InputError("voxel size", f"{voxel}", "expected a positive length in map units")
-        self.voxel = voxel
+        self.voxel = checked_voxel(voxel)
         self.views = 0
         self._config = config
         self._held = np.zeros((2, 0), np.int64)  # packed places of all blocks, in order, and their slots
@@ -104,8 +110,6 @@ class TsdfVolume:
         self._distance = np.zeros((0, BLOCK**3), np.int32)
         self._seen = np.zeros((0, BLOCK**3), np.int16)
         self._color = np.zeros((0, BLOCK**3, 4), np.int32)  # sums of w r, w g, w b and w, near the surface
-        place = np.arange(BLOCK) * voxel
-        self._offsets = np.stack(np.meshgrid(place, place, place, indexing="ij")).reshape(3, -1).astype(np.float32)
 
     def integrate(self, view: SurfaceView, cam_from_map: np.ndarray) -> np.ndarray:
         """Adds what a view says, its pose being cam_from_map (4, 4). Packed places (n,) of the blocks whose part of the
@@ -122,9 +126,8 @@ class TsdfVolume:
             return np.zeros(0, np.int64)
         self.views += sign
         slots = self._hold(packed(places))
-        rotation, translation = cam_from_map[:3, :3], cam_from_map[:3, 3]
-        origins = (places * (BLOCK * self.voxel) @ rotation.T + translation).astype(np.float32)
-        offsets = rotation.astype(np.float32) @ self._offsets
+        origins = block_origins(places, BLOCK * self.voxel, cam_from_map)
+        offsets = voxel_offsets(self.voxel, cam_from_map)
         pixels = view.table.look_up(origins, offsets)
         any_left = np.zeros(len(slots), bool)
         halves(
@@ -132,7 +135,7 @@ class TsdfVolume:
                 self._weight, self._distance, self._seen, self._color, self._behind, self._known, slots,
                 origins, offsets, pixels, view.planes, view.weights, view.colors,
                 np.float32(self._config.truncation * self.voxel), np.float32(self._config.front),
-                np.float32(_COLORED * self.voxel), sign,
+                np.float32(COLORED * self.voxel), sign,
                 self._config.min_views, first, end, any_left,
             ),
             len(slots),
@@ -145,30 +148,15 @@ class TsdfVolume:
 
     def _touched(self, view: SurfaceView, cam_from_map: np.ndarray) -> np.ndarray:
         """Places (n, 3), in order, of the blocks that the surface of a view passes through or comes close to."""
-        some = np.flatnonzero(view.weights)[::_SPARSE]
+        some = seeds(view)
         if not len(some):
             return np.zeros((0, 3), int)
-        side = BLOCK * self.voxel
-        rotation = (cam_from_map[:3, :3].T / side).astype(np.float32)
-        shift = (cam_from_map[:3, :3].T @ cam_from_map[:3, 3] / side).astype(np.float32)
+        rotation, shift = into_blocks(cam_from_map, BLOCK * self.voxel)
         tau = np.float32(self._config.truncation * self.voxel)
         across = np.float32(2 * self.voxel)
         near, low, high = _blocks_near(view.points, view.planes, some, tau, across, rotation, shift)
-        farthest = BLOCK * np.abs(np.array([low, high], np.int64)).max()
-        if farthest >= REACH - 2 * BLOCK:
-            raise InputError(
-                "voxel size",
-                f"at {self.voxel:.3g} one view reaches {farthest} voxels from the map's origin",
-                f"at most {REACH} are possible: choose larger voxels",
-            )
-        shape = high - low + 1
-        if np.prod(shape.astype(float)) > 1e8:
-            raise InputError(
-                "voxel size",
-                f"at {self.voxel:.3g} one view spans {' x '.join(map(str, shape))} blocks of {BLOCK} voxels",
-                "choose larger voxels",
-            )
-        touched = np.zeros(shape, bool)
+        check_reach(self.voxel, low, high)
+        touched = np.zeros(high - low + 1, bool)
         _mark(touched, near, low)
         result: np.ndarray = np.argwhere(touched) + low
         return result

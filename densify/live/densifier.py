@@ -24,11 +24,11 @@ from densify.alignment import Alignment
 from densify.config import DensifyConfig, LiveConfig, MethodConfig
 from densify.coverage import Given, with_contributions
 from densify.dense_map import DenseMap
-from densify.fusers import view_to_fuse
+from densify.fusers import device_of, view_to_fuse
+from densify.fusion.chosen import Volume, volume_on
 from densify.fusion.marching_cubes import unpacked
 from densify.fusion.patches import BlockSurface, Patch, joined
 from densify.fusion.rectify import SurfaceView
-from densify.fusion.volume import TsdfVolume
 from densify.judging.ahead import AheadConfig
 from densify.judging.images import Seen
 from densify.live.ahead import AheadJudge, images_of
@@ -115,7 +115,8 @@ class Densifier:
         self._model = model
         self._light, self._mask = light or PhotometricCalibration(), mask
         self._kept: dict[str, _Kept] = {}
-        self._volume: TsdfVolume | None = None
+        self._device = device_of(model)
+        self._volume: Volume | None = None
         self._surface = BlockSurface()
         self._changed: list[np.ndarray] = []
 
@@ -261,7 +262,7 @@ class Densifier:
     def dense_map(self, seen: Mapping[str, Seen] = MappingProxyType({})) -> DenseMap:
         """The surface with all that it rests on, as densify makes it; what its images tell, where `seen` was asked, is
         in its confidence. Raises InputError while there is no keyframe."""
-        volume = TsdfVolume(1.0, self.config.fusion) if self._volume is None else self._volume
+        volume = volume_on("cpu", 1.0, self.config.fusion) if self._volume is None else self._volume
         given = {k.keyframe.name: k.given for k in self._kept.values() if k.given}
         return with_contributions(DenseMap.of(volume, self._submap(), self.alignments), given, seen)
 
@@ -323,7 +324,7 @@ class Densifier:
         # Taking out costs as much as putting in: where most has moved, it is cheaper to begin again.
         if self._volume is not None and (2 * len(pairs) > len(self._kept) or not fits):
             self._changed.append(self._surface.places)
-            self._volume = TsdfVolume(self._volume.voxel if fits else voxel, self.config.fusion)
+            self._volume = volume_on(self._device, self._volume.voxel if fits else voxel, self.config.fusion)
             for kept in list(self._kept.values()):
                 self._add(kept)
             return len(pairs)
@@ -345,7 +346,7 @@ class Densifier:
                 view = self._view(kept, prediction)
                 given = Given.of(view, prediction)
             if self._volume is None:
-                self._volume = TsdfVolume(self._voxel(kept), self.config.fusion)
+                self._volume = volume_on(self._device, self._voxel(kept), self.config.fusion)
             self._changed.append(self._volume.integrate(view, kept.keyframe.cam_from_map))
         self._kept[kept.keyframe.name] = kept if given is None else replace(kept, given=given)
 

@@ -209,7 +209,7 @@ def test_colons_that_nothing_was_tuned_on(depth, monkeypatch):
         tree, poses = cKDTree(cloud), {f.number: f.true_world_from_cam for f in frames}
         for way, (view, volume) in WAYS.items():
             monkeypatch.setattr(fusers, "surface_view", view)
-            monkeypatch.setattr(fusers, "TsdfVolume", volume)
+            monkeypatch.setattr(fusers, "volume_on", lambda device, voxel, config, made=volume: made(voxel, config))
             if way != "ours":
                 monkeypatch.setattr(fusers, "contribution", lambda *_: fusers.Contribution(1.0, 1.0))
             dense = densify_submap(submap, sequence(frames), model, DensifyConfig()).dense
