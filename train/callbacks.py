@@ -22,41 +22,82 @@ from lightdepth.photometry import brightness
 from lightdepth.ranges import at_least, checked
 
 
+@dataclass(frozen=True)
+class Speed:
+    """How fast a run trained, its validations left aside: frames a second over all processes."""
+
+    frames_per_s: float
+    without_waiting: float
+    """had the frames always been there: no loader makes it faster"""
+
+    @property
+    def waiting(self) -> float:
+        """Share of the time that this process waited for frames."""
+        return 1 - self.frames_per_s / self.without_waiting
+
+    def record(self) -> dict[str, float]:
+        """As run.json has it."""
+        found = {**vars(self), "waiting_share": self.waiting}
+        return {name: round(value, 4) for name, value in found.items()}
+
+    def __str__(self) -> str:
+        return f"{self.frames_per_s:.3g} frames/s ({self.without_waiting:.3g} without waiting for them)"
+
+
 class TrainingProgress(pl.Callback):
     """One line every `every` steps, and at least every ten seconds, with speed and time left, and one per validation.
-    `echo` takes each line.
+    `echo` takes each line; `waited` gives the seconds for which this process has waited for frames.
 
-    The logger gets the speed as frames per second, over all processes.
+    The logger gets the speed as frames per second, over all processes, and the share of time spent waiting.
     """
 
-    def __init__(self, echo: Callable[[str], None], every: int = 50) -> None:
-        self.echo, self.every = echo, every
+    def __init__(self, echo: Callable[[str], None], every: int = 50, waited: Callable[[], float] = lambda: 0.0) -> None:
+        self.echo, self.every, self.waited = echo, every, waited
+        self.speed: Speed | None = None
+        """from the first step until the last"""
         self._start, self._first, self._said = 0.0, 0, 0.0
+        self._waited_before, self._judging, self._judged = 0.0, 0.0, 0.0
 
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         self._start = self._said = time.monotonic()
-        self._first = trainer.global_step
+        self._first, self._waited_before = trainer.global_step, self.waited()
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: FrameBatch, batch_idx: int
     ) -> None:
         step, total, now = trainer.global_step, trainer.estimated_stepping_batches, time.monotonic()
-        if step % self.every and step != total and now - self._said < SECONDS:
+        seen = (step - self._first) * len(batch.image) * trainer.accumulate_grad_batches * trainer.world_size
+        training = max(now - self._start - self._judged, 1e-9)
+        working = max(training - (self.waited() - self._waited_before), 1e-9)
+        if seen:  # not while gradients of the first step are gathered
+            self.speed = Speed(seen / training, seen / working)
+        if self.speed is None or (step % self.every and step != total and now - self._said < SECONDS):
             return
         self._said = now
         rate = (step - self._first) / max(now - self._start, 1e-9)
-        frames = rate * len(batch.image) * trainer.accumulate_grad_batches * trainer.world_size
         if trainer.logger is not None:
-            trainer.logger.log_metrics({"train/frames_per_s": frames}, step=step)
+            speed = {"train/frames_per_s": self.speed.frames_per_s, "train/waiting_share": self.speed.waiting}
+            trainer.logger.log_metrics(speed, step=step)
         loss = _number(trainer.callback_metrics.get("train/loss"))
-        line = f"step {step}/{total:.0f}  loss {loss}  {rate:.1f} steps/s, {frames:.0f} frames/s"
+        line = f"step {step}/{total:.0f}  loss {loss}  {rate:.1f} steps/s, {self.speed}"
         if math.isfinite(total):
             line += f"  {_clock((total - step) / max(rate, 1e-9))} left"
         self.echo(line)
 
+    def on_validation_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self._judging = time.monotonic()
+
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if not trainer.sanity_checking:
+            self._judged += time.monotonic() - self._judging
         if trainer.training or trainer.state.fn == "fit":
             self.echo(f"step {trainer.global_step}  {validation_line(trainer.callback_metrics)}")
+
+
+def speed_of(trainer: pl.Trainer) -> Speed | None:
+    """How fast it trained; None where it made no step, or other processes made them."""
+    found = (callback.speed for callback in trainer.callbacks if isinstance(callback, TrainingProgress))  # type: ignore[attr-defined]  # Lightning has it
+    return next(found, None)
 
 
 @dataclass(frozen=True)

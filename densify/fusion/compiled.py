@@ -31,6 +31,8 @@ from numba.core.caching import (
     UserWideCacheLocator,
 )
 
+from lightdepth.files.own_folder import own_cache
+
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function compiled for one thread, with the interpreter's lock released.
@@ -47,13 +49,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 def cache_folder() -> Path | None:
     """Where machine code is kept: NUMBA_CACHE_DIR, or a folder of the user's; None where there is none."""
     given = numba.config.CACHE_DIR  # set at run time
-    if given:
-        return Path(given)
-    try:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError:  # a user without a home
-        return None
-    return Path(home) / "lightdepth" / "compiled"
+    return Path(given) if given else own_cache("compiled")
 
 
 def open_to_others(folder: Path) -> bool:
