@@ -41,6 +41,13 @@ def log_closed_form(image: Tensor, mask: Tensor, rays: Tensor, light: LightTerms
     return 0.5 * (light.gain.log() + spread(rays, light).log() - light.gamma * log_v)
 
 
+def most_spread(image: Tensor, light: LightTerms) -> Tensor:
+    """What no standard deviation of `log_closed_form` inside the mask exceeds, (B, 1, 1, 1): half of how far brightness
+    and the light's spread reach. Images (B, 3, H, W)."""
+    brightest = image.flatten(1).amax(1).clamp(min=1).reshape(-1, 1, 1, 1)
+    return 0.25 * light.gamma * (brightest / V_FLOOR).log() + 0.5 * light.mu
+
+
 def informative(image: Tensor, mask: Tensor) -> Tensor:
     """Pixels whose brightness says something about distance: inside the mask and not black. (B, 1, H, W) bool"""
     return mask & (brightness(image) > V_FLOOR)

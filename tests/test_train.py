@@ -18,6 +18,7 @@ from training import CAMERA, LIGHT, TINY_RUN, batch_of, write_sequence
 
 import train.fit as fit_module
 from lightdepth.checkpoint import load_model, read_card
+from lightdepth.command_line.dry import Planned
 from lightdepth.datasets import write_c3vd, write_folder
 from lightdepth.datasets.endomapper import write_endomapper
 from lightdepth.decline import log_closed_form
@@ -28,7 +29,7 @@ from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
 from lightdepth.network import NetworkConfig
 from lightdepth.tube import lens
-from train.callbacks import validation_line
+from train.callbacks import Speed, validation_line
 from train.commands.train import train
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs" / "train").glob("*.yaml"))
@@ -352,9 +353,30 @@ def test_a_run_that_no_longer_gets_better_ends_early(tmp_path):
         quick(tmp_path, "--fit.patience", "1", "--fit.monitor", "last", name="no")
 
 
-def test_speed_is_logged_in_frames(tmp_path):
+def test_speed_is_told_beside_that_without_waiting_for_frames(tmp_path, monkeypatch):
     run = quick(tmp_path)
-    assert "frames/s" in (run / "log.txt").read_text()
+    said = r"[\d.]+ frames/s \([\d.]+ without waiting for them\)"
+    assert re.search(said, (run / "log.txt").read_text()) and re.search(said, (run / "report.html").read_text())
+    found = json.loads((run / "run.json").read_text())["timings"]
+    assert 0 < found["frames_per_s"] <= found["without_waiting"] and 0 <= found["waiting_share"] < 1
+    monkeypatch.setattr(Speed, "waiting", 0.25)
+    run = quick(tmp_path, name="slow")
+    assert "25% of the training was spent waiting for frames: --data.num-workers" in (run / "log.txt").read_text()
+
+
+def test_kept_frames_are_the_runs_own_affair_and_a_dry_run_keeps_none(tmp_path):
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    with pytest.raises(Planned):
+        quick(tmp_path, "--data.cache", str(kept), "--dry_run")
+    assert not any(kept.iterdir())
+    plain = quick(tmp_path, name="plain")
+    runs = [quick(tmp_path, "--data.cache", str(kept), name=name) for name in ("cold", "warm")]
+    assert equal(state(plain), state(runs[0])) and equal(state(plain), state(runs[1]))
+    assert len([file for file in kept.rglob("*.safetensors") if file.stem.isdecimal()]) == 12
+    for run in runs:
+        assert "cache: cache-00000000" in (run / "config.yaml").read_text()  # known by name, and not read for it
+        assert str(kept) not in (run / "run.json").read_text() + (run / "log.txt").read_text()
 
 
 def write_images(folder: Path, image: np.ndarray, count: int = 12) -> Path:

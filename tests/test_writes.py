@@ -56,6 +56,7 @@ ALLOWED = {
     "densify/viewing/drawn.py: gltf": "bytes for a browser: there is no file",
     "train/commands/ablate.py: _ablate": "write_table and write_inputs use write_whole",
     "train/checkpoints.py: _keep": "renames a checkpoint that write_whole wrote: the one before is kept",
+    "train/frame_cache.py: keep": "write_remade renames, and what it writes shows by its sum whether it is whole",
     "train/fit.py: _fitted": "write_inputs uses write_whole",
     "train/watching.py: __call__": "log.txt of a training, which grows while it lasts",
     "train/commands/adapt.py: _fit": _RUN,

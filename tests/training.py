@@ -1,5 +1,6 @@
 """A camera, a light and small data to train on."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,9 @@ from scenes import cylinder
 
 from lightdepth.calibration import write_camera, write_light
 from lightdepth.camera import Pinhole
-from lightdepth.frame import to_batch
+from lightdepth.datasets import write_c3vd
+from lightdepth.datasets.c3vd import C3VD
+from lightdepth.frame import Frame, to_batch
 from lightdepth.photometry import PhotometricCalibration
 from train.loader import collate
 
@@ -32,4 +35,28 @@ def write_sequence(folder: Path, count: int = 12) -> Path:
         cv2.imwrite(str(folder / "frames" / f"{i:04d}.png"), np.round(image[..., ::-1] * 255).astype(np.uint8))
     write_camera(CAMERA, folder / "camera.json")
     write_light(LIGHT, folder / "light.json")
+    return folder
+
+
+def write_c3vd_frames(folder: Path, count: int) -> Path:
+    """Noisy textured frames in C3VD's octagon, about as large on disk as its own (1.9 MB), with depth and poses."""
+    rng = np.random.default_rng(0)
+    smooth = cv2.resize(rng.uniform(0.2, 0.7, (40, 50, 3)), (1350, 1080), interpolation=cv2.INTER_CUBIC)
+    rows, columns = np.mgrid[:1080, :1350]
+    inside = np.minimum(columns, 1349 - columns) + np.minimum(rows, 1079 - rows) > 270
+    distance = np.broadcast_to(np.linspace(5, 60, 1080, dtype=np.float32)[:, None], (1080, 1350))
+    frame = Frame("0000_color", np.zeros((1080, 1350, 3), np.float32), C3VD, true_world_from_cam=np.eye(4))
+    images = (np.clip(np.roll(smooth, 9 * i, 1) + 0.004 * rng.normal(size=smooth.shape), 0, 1) for i in range(count))
+    write_c3vd(
+        [
+            replace(
+                frame,
+                name=f"{i:04d}_color",
+                image=(image * inside[..., None]).astype(np.float32),
+                true_distance=distance * inside,
+            )
+            for i, image in enumerate(images)
+        ],
+        folder,
+    )
     return folder

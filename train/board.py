@@ -38,7 +38,7 @@ _STRIP = 18
 _POINTS = 4000  # of each frame in the plot of decline
 CHARTS = {
     "loss and its terms": {
-        "training": ["Multiline", [r"train/(?!frames_per_s)\w+$"]],
+        "training": ["Multiline", [r"train/(?!frames_per_s|waiting_share)\w+$"]],
         "validation": ["Multiline", [r"val/(?!.*_median)\w+$"]],
     },
     "errors of the network and the closed form": {

@@ -13,7 +13,7 @@ import lightning.pytorch as pl
 import torch
 
 from lightdepth.command_line.heartbeat import SECONDS
-from lightdepth.decline import informative, log_closed_form
+from lightdepth.decline import informative, log_closed_form, most_spread
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.frame import FrameBatch
 from lightdepth.losses.masked import masked_std
@@ -22,41 +22,82 @@ from lightdepth.photometry import brightness
 from lightdepth.ranges import at_least, checked
 
 
+@dataclass(frozen=True)
+class Speed:
+    """How fast a run trained, its validations left aside: frames a second over all processes."""
+
+    frames_per_s: float
+    without_waiting: float
+    """had the frames always been there: no loader makes it faster"""
+
+    @property
+    def waiting(self) -> float:
+        """Share of the time that this process waited for frames."""
+        return 1 - self.frames_per_s / self.without_waiting
+
+    def record(self) -> dict[str, float]:
+        """As run.json has it."""
+        found = {**vars(self), "waiting_share": self.waiting}
+        return {name: round(value, 4) for name, value in found.items()}
+
+    def __str__(self) -> str:
+        return f"{self.frames_per_s:.3g} frames/s ({self.without_waiting:.3g} without waiting for them)"
+
+
 class TrainingProgress(pl.Callback):
     """One line every `every` steps, and at least every ten seconds, with speed and time left, and one per validation.
-    `echo` takes each line.
+    `echo` takes each line; `waited` gives the seconds for which this process has waited for frames.
 
-    The logger gets the speed as frames per second, over all processes.
+    The logger gets the speed as frames per second, over all processes, and the share of time spent waiting.
     """
 
-    def __init__(self, echo: Callable[[str], None], every: int = 50) -> None:
-        self.echo, self.every = echo, every
+    def __init__(self, echo: Callable[[str], None], every: int = 50, waited: Callable[[], float] = lambda: 0.0) -> None:
+        self.echo, self.every, self.waited = echo, every, waited
+        self.speed: Speed | None = None
+        """from the first step until the last"""
         self._start, self._first, self._said = 0.0, 0, 0.0
+        self._waited_before, self._judging, self._judged = 0.0, 0.0, 0.0
 
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         self._start = self._said = time.monotonic()
-        self._first = trainer.global_step
+        self._first, self._waited_before = trainer.global_step, self.waited()
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: FrameBatch, batch_idx: int
     ) -> None:
         step, total, now = trainer.global_step, trainer.estimated_stepping_batches, time.monotonic()
-        if step % self.every and step != total and now - self._said < SECONDS:
+        seen = (step - self._first) * len(batch.image) * trainer.accumulate_grad_batches * trainer.world_size
+        training = max(now - self._start - self._judged, 1e-9)
+        working = max(training - (self.waited() - self._waited_before), 1e-9)
+        if seen:  # not while gradients of the first step are gathered
+            self.speed = Speed(seen / training, seen / working)
+        if self.speed is None or (step % self.every and step != total and now - self._said < SECONDS):
             return
         self._said = now
         rate = (step - self._first) / max(now - self._start, 1e-9)
-        frames = rate * len(batch.image) * trainer.accumulate_grad_batches * trainer.world_size
         if trainer.logger is not None:
-            trainer.logger.log_metrics({"train/frames_per_s": frames}, step=step)
+            speed = {"train/frames_per_s": self.speed.frames_per_s, "train/waiting_share": self.speed.waiting}
+            trainer.logger.log_metrics(speed, step=step)
         loss = _number(trainer.callback_metrics.get("train/loss"))
-        line = f"step {step}/{total:.0f}  loss {loss}  {rate:.1f} steps/s, {frames:.0f} frames/s"
+        line = f"step {step}/{total:.0f}  loss {loss}  {rate:.1f} steps/s, {self.speed}"
         if math.isfinite(total):
             line += f"  {_clock((total - step) / max(rate, 1e-9))} left"
         self.echo(line)
 
+    def on_validation_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self._judging = time.monotonic()
+
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if not trainer.sanity_checking:
+            self._judged += time.monotonic() - self._judging
         if trainer.training or trainer.state.fn == "fit":
             self.echo(f"step {trainer.global_step}  {validation_line(trainer.callback_metrics)}")
+
+
+def speed_of(trainer: pl.Trainer) -> Speed | None:
+    """How fast it trained; None where it made no step, or other processes made them."""
+    found = (callback.speed for callback in trainer.callbacks if isinstance(callback, TrainingProgress))  # type: ignore[attr-defined]  # Lightning has it
+    return next(found, None)
 
 
 @dataclass(frozen=True)
@@ -73,6 +114,10 @@ class DiagnosisConfig:
     constant: Annotated[int, at_least(1)] = 200
     """Number of batches in a row in which the network gives nearly one distance everywhere although brightness varies,
     after which the run is stopped with an error. More wait longer."""
+
+
+_CONSTANT = 0.01
+"""Of the closed form's standard deviation, below which a distance counts as constant."""
 
 
 class Diagnosis(pl.Callback):
@@ -102,10 +147,11 @@ class Diagnosis(pl.Callback):
     def on_before_optimizer_step(
         self, trainer: pl.Trainer, module: pl.LightningModule, optimizer: torch.optim.Optimizer
     ) -> None:
-        wrong = [n for n, p in module.named_parameters() if p.grad is not None and not torch.isfinite(p.grad).all()]
-        if not wrong:
+        gradients = {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
+        finite = [torch.isfinite(gradient).all() for gradient in gradients.values()]
+        if not finite or torch.stack(finite).all():  # a GPU is waited for once, not for each of them
             return
-        self._bad = wrong[0]
+        self._bad = list(gradients)[[bool(each) for each in finite].index(False)]
         if getattr(trainer.precision_plugin, "scaler", None) is None:  # a scaler skips such steps by itself
             for parameter in module.parameters():
                 parameter.grad = None
@@ -114,7 +160,15 @@ class Diagnosis(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: FrameBatch, batch_idx: int
     ) -> None:
-        wrong = bool(self._bad) or not bool(torch.isfinite(outputs["loss"]))
+        usable = informative(batch.image, batch.mask)
+        assert isinstance(module, LightDepth), type(module)
+        white = usable & (brightness(batch.image) >= module.loss_config.white)
+        spread = masked_std(outputs["distance"].log(), usable)
+        # The closed form takes longer than all the rest, and hardly ever has to be asked.
+        never = (spread >= _CONSTANT * most_spread(batch.image, batch.light)).any()
+        told = [torch.isfinite(outputs["loss"]).all(), (usable & ~white).any(), never]
+        finite, seen, varies = torch.stack(told).tolist()
+        wrong = bool(self._bad) or not finite
         self.skipped += wrong
         where = self._where(trainer, batch_idx)
         if self._in_a_row("number", wrong) >= self.config.patience:
@@ -123,10 +177,7 @@ class Diagnosis(pl.Callback):
                 f"{_not_finite(batch, outputs, module, self._bad)}. Lower model.learning_rate, train in precision "
                 "32-true, or leave those frames out; the checkpoints until here are kept"
             )
-        usable = informative(batch.image, batch.mask)
-        assert isinstance(module, LightDepth), type(module)
-        white = usable & (brightness(batch.image) >= module.loss_config.white)
-        if self._in_a_row("blind", not (usable & ~white).any()) >= self.config.blind:
+        if self._in_a_row("blind", not seen) >= self.config.blind:
             inside = batch.mask.sum().clamp(min=1)
             raise InputError(
                 "training",
@@ -136,9 +187,10 @@ class Diagnosis(pl.Callback):
                 "outside the mask",
                 "expected images that show the decline of light: check exposure, mask and image folder",
             )
-        closed = log_closed_form(batch.image, batch.mask, batch.rays, batch.light)
-        spread, expected = masked_std(outputs["distance"].log(), usable), masked_std(closed, usable)
-        flat = bool(((spread < 0.01 * expected) & (expected > 0.05)).all())
+        flat, expected = False, spread
+        if not varies:
+            expected = masked_std(log_closed_form(batch.image, batch.mask, batch.rays, batch.light), usable)
+            flat = bool(((spread < _CONSTANT * expected) & (expected > 0.05)).all())
         if self._in_a_row("constant", flat) >= self.config.constant:
             raise PartialFailure(
                 f"training: distance has been constant for {self.config.constant} batches, the last {where}: its log "

@@ -14,7 +14,8 @@ from lightdepth.module import LightDepth
 from lightdepth.reporting.plan import timed
 
 from .colons import SceneMaker, TubeData, tube_scene, val_scene
-from .datamodule import FrameDataModule, Opened
+from .datamodule import FrameDataModule
+from .frame_sets import Opened
 from .loader import collate
 
 _UPDATE = 1.1

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple, cast
+from typing import Annotated, cast
 
 import lightning.pytorch as pl
 import numpy as np
@@ -20,17 +19,19 @@ import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, Sampler
 
 from lightdepth.colour import Colours
-from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
+from lightdepth.datasets import FormatName, SequenceSource
 from lightdepth.datasets.coloured import LOOKED_AT, colours_of
 from lightdepth.datasets.splits import check_apart, folders, read_split
 from lightdepth.errors import InputError
-from lightdepth.frame import FrameBatch, to_batch
+from lightdepth.frame import FrameBatch
 from lightdepth.ranges import BELOW_ONE, BETWEEN, SEED, Range, at_least, checked, ends_of
 from lightdepth.reporting.progress import Progress
 from train.augmentation import augmented, drawn_for
 from train.colons import SceneMaker, TubeData, colon_seeds, tube_scene, val_scene, with_reflectance
+from train.frame_cache import FrameCache, cache_root, check_outside
 from train.frame_lists import Listed, listed_rows, open_listed
-from train.loader import loader
+from train.frame_sets import Frames, Opened, Rendered, held_out_count
+from train.loader import Waited, loader
 from train.order import ALONE, Halves, Parted, Place, Shuffled
 
 _NO_TUBE = TubeData()
@@ -89,6 +90,10 @@ class FrameData:
     num_workers: Annotated[int, at_least(0, up_to=1024)] = 0
     """Number of extra processes that read frames; with 0 the main one reads them itself, between steps. More read
     faster, as far as there are cores."""
+    cache: bool | str = False
+    """Folder in which frames are kept once they are decoded, at the size that they are trained at, for all epochs and
+    later runs: some 1.5 MB each at 320x256, pictures of patients where the frames are. true: a folder of your own,
+    below ~/.cache or XDG_CACHE_HOME. false: they are decoded each time. It changes the time, and no result."""
     augment: bool = True
     """true: training images are flipped at random, and made brighter or darker by some 10 %. false: they are shown as
     they are. Validation images are never changed."""
@@ -137,6 +142,9 @@ class FrameDataModule(pl.LightningDataModule):
         """takes a sentence on a frame that could not be read, when it is met"""
         self.parted = True
         """whether each process of a distributed run has frames of its own, or all of them have all"""
+        self._sources: dict[str, SequenceSource] = {}
+        self._unkept: list[str] = []
+        self._waited = Waited()
         check_apart(self.sequences, self.val_sequences)
         self._train: ConcatDataset[FrameBatch] | None = None
         self._val: ConcatDataset[FrameBatch] | None = None
@@ -150,6 +158,8 @@ class FrameDataModule(pl.LightningDataModule):
         if self._train is not None:
             return
         opened = self.open_sequences()
+        if self.config.cache:
+            self._keep_decoded(opened)
         train: list[Dataset[FrameBatch]] = [*opened.train]
         val: list[Dataset[FrameBatch]] = [*opened.val]
         if self.tube.scenes + self.tube.val_scenes > 0:
@@ -165,10 +175,10 @@ class FrameDataModule(pl.LightningDataModule):
     def open_sequences(self) -> Opened:
         """Those to train and to validate on, and no colons. Raises InputError where there is, colons counted, nothing
         to train or to validate on."""
-        train: list[_Frames] = []
-        val: list[_Frames] = []
+        train: list[Frames] = []
+        val: list[Frames] = []
         to_train, to_validate = self._folders()
-        opened = [(path, open_listed(self.config.source, path, of)) for path, of in to_train]
+        opened = [(path, open_listed(self._source, path, of)) for path, of in to_train]
         rows = [list(range(len(frames))) for _, frames in opened]
         if self.config.frames is not None:
             if len(dict(opened)) < len(opened):
@@ -187,11 +197,13 @@ class FrameDataModule(pl.LightningDataModule):
             held_out = 0 if to_validate else held_out_count(len(chosen), self.config.held_out)
             if len(chosen) <= held_out:
                 raise InputError(path, f"{len(chosen)} frame", "expected at least two, one of them to validate on")
-            train.append(_Frames(chosen[: len(chosen) - held_out], self.size, path))
+            train.append(Frames(chosen[: len(chosen) - held_out], self.size, path))
             if held_out:
-                val.append(_Frames(chosen[-held_out:], self.size, path))
+                val.append(Frames(chosen[-held_out:], self.size, path))
         for path, of in to_validate:
-            val.append(_Frames(open_listed(self.config.source, path, of), self.size, path))
+            val.append(Frames(open_listed(self._source, path, of), self.size, path))
+        if (root := cache_root(self.config.cache)) is not None:
+            check_outside(root, [*self.sequences, *self.val_sequences])
         if not train and not self.tube.scenes:
             raise InputError("data", "nothing to train on", "give --data.sequences FOLDER, or --data.tube.scenes N")
         if not val and not self.tube.val_scenes:
@@ -201,17 +213,41 @@ class FrameDataModule(pl.LightningDataModule):
         listed_of = [(path, frames, listed) for (path, frames), listed in zip(opened, rows, strict=True)]
         return Opened(train, val, listed_of)
 
+    def _source(self, path: str, format: str | None = None) -> SequenceSource:
+        self._sources[path] = self.config.source(path, format)
+        return self._sources[path]
+
+    def _keep_decoded(self, opened: Opened) -> None:
+        """Has frames kept once they are decoded, if that is asked for."""
+        root = cache_root(self.config.cache)
+        parts: dict[str, list[Frames]] = {}
+        for part in (*opened.train, *opened.val):
+            parts.setdefault(part.path, []).append(part)
+        for path, same in parts.items():
+            first = next((batch for part in same if (batch := part.first()) is not None), None)
+            if root is None or first is None:
+                continue  # none of its frames can be read, which is said where they are asked for
+            cache = FrameCache(root, self._sources[path], self.size, first)
+            said = cache.prepare(sum(map(len, same)))
+            self._unkept += [said] if said else []
+            for part in same:
+                part.cache = cache
+
     @property
     def doubts(self) -> list[str]:
         """Sentences on training sequences that are not what the light's decline can teach from, and on frames that
         could not be read until now."""
         coloured = [f"{path}: {doubt}" for path, colours in self.colours.items() for doubt in colours.doubts]
-        return [*coloured, *(said for part in self._unread.values() for said in part.values())]
+        return [*coloured, *self._unkept, *(said for part in self._unread.values() for said in part.values())]
 
     @property
     def unread(self) -> dict[str, int]:
         """Number of frames to train and to validate on that could not be read until now, in this process."""
         return {part: len(said) for part, said in self._unread.items()}
+
+    def seconds_waited(self) -> float:
+        """Seconds for which this process has waited for frames to train on."""
+        return self._waited.seconds
 
     def gather(self) -> None:
         """Takes what the other processes of a distributed run could not read; each of them has to call it."""
@@ -255,7 +291,7 @@ class FrameDataModule(pl.LightningDataModule):
         made: list[Dataset[FrameBatch]] = []
         for i, seed in enumerate(seeds):
             frames = make(self.tube, seed, i, self.size)
-            made.append(_Cached(frames, [f"colon {seed} frame {k}" for k in range(len(frames))]))
+            made.append(Rendered(frames, [f"colon {seed} frame {k}" for k in range(len(frames))]))
             bar.advance()
         return made
 
@@ -280,7 +316,7 @@ class FrameDataModule(pl.LightningDataModule):
 
     def _order(self) -> Shuffled:
         assert self._train is not None
-        colons = sum(len(part) for part in self._train.datasets if isinstance(part, _Cached))
+        colons = sum(len(part) for part in self._train.datasets if isinstance(part, Rendered))
         frames = len(self._train) - colons
         if self.config.halves and frames and colons:
             return Halves(frames, colons, self.batch_size * self._place().world, self.config.seed)
@@ -321,7 +357,8 @@ class FrameDataModule(pl.LightningDataModule):
     ) -> DataLoader[FrameBatch]:
         left_out = partial(self._left_out, part)
         workers, replacing = self.config.num_workers, part == "train"  # an error counts once
-        return loader(dataset, self.batch_size, workers, left_out, order, drop_last, replacing)
+        waited = self._waited if part == "train" else None
+        return loader(dataset, self.batch_size, workers, left_out, order, drop_last, replacing, waited)
 
     def _left_out(self, part: str, error: InputError) -> None:
         said = self._unread[part]
@@ -333,54 +370,3 @@ class FrameDataModule(pl.LightningDataModule):
 
 def warn(sentence: str) -> None:
     warnings.warn(sentence, stacklevel=3)
-
-
-def held_out_count(frames: int, share: float) -> int:
-    """How many frames at the end of a sequence are held out."""
-    return max(1, int(share * frames))
-
-
-class _Frames(Dataset[FrameBatch]):
-    """Frames read when asked for, at one size."""
-
-    def __init__(self, frames: FrameSequence, size: tuple[int, int], path: str) -> None:
-        self.frames, self.size = frames, size
-        self.names = [f"{path}: {name}" for name in frames.names]
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: int) -> FrameBatch:
-        return to_batch(self.frames[index], self.size)
-
-
-class _Cached(Dataset[FrameBatch]):
-    def __init__(self, batches: list[FrameBatch], names: list[str]) -> None:
-        self.batches, self.names = batches, names
-
-    def __len__(self) -> int:
-        return len(self.batches)
-
-    def __getitem__(self, index: int) -> FrameBatch:
-        return self.batches[index]
-
-
-class Opened(NamedTuple):
-    """The sequences of a run: what is trained and validated on, and each that trains with its rows that are used."""
-
-    train: list[_Frames]
-    val: list[_Frames]
-    listed: list[tuple[str, FrameSequence, list[int]]]
-
-    def counts(self, tube: TubeData) -> dict[str, int]:
-        """Number of frames to train and to validate on, colons among them."""
-        train, val = (sum(map(len, part)) for part in (self.train, self.val))
-        return {"train": train + tube.scenes * tube.frames, "val": val + tube.val_scenes * tube.frames}
-
-    def first(self) -> FrameBatch | None:
-        """A frame of them, the first that can be read; None where there is none."""
-        for part in (*self.train, *self.val):
-            for i in range(min(len(part), 5)):
-                with suppress(InputError):
-                    return part[i]
-        return None

@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -43,10 +43,9 @@ from lightdepth.signals import finishing_first
 from lightdepth.uncertainty import Calibration, Doubted, chart_png, doubted, fit_calibration, summary
 
 from .board import hyper_parameters, opening
-from .callbacks import validation_line
-from .card import Card, Doubt
+from .callbacks import Speed, speed_of, validation_line
+from .card import Doubt
 from .checkpoints import BEST, LAST, Start, clear_cut_off, exported_of, newest
-from .colons import TubeData
 from .costs import training_steps
 from .datamodule import FrameDataModule, warn
 from .folder import begin_in, first_process, has_checkpoint, training_folder
@@ -54,11 +53,14 @@ from .going_on import settings_before, warn_of_length, warn_of_settings
 from .report import FILES, show_frames, training_page
 from .requeue import requeued
 from .running import NO_ROOT, quiet
+from .trained_card import TrainedCard, shared_by, trained_on
 from .trainer_options import check_trainer_options
 from .watching import Echo, FitConfig
 from .watching import with_callbacks as _with_callbacks
 
 _PRECISIONS = (None, 32, "32", "32-true", 16, "16", "16-mixed", "bf16", "bf16-mixed")
+_MUCH_WAITING = 0.1
+_CURE = "--data.num-workers reads them ahead, --data.cache true keeps them decoded"
 _FIT = FitConfig()
 T = TypeVar("T")
 
@@ -155,7 +157,8 @@ def _fitted(
     _opened(data.setup)
     asked = {"settings": yaml.safe_load(job.config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
     output = output_of(folder) or folder
-    names = Names() if KEPT.get() else names_of(asked, (output, folder), argv=job.arguments)
+    unread = {data.config.cache: "0" * 64} if isinstance(data.config.cache, str) else {}  # gigabytes, of any state
+    names = Names() if KEPT.get() else names_of(asked, (output, folder), argv=job.arguments, hashed=unread)
     echo = Echo(folder / "log.txt", names)
     before = settings_before(folder) if start is not None else None
     if first_process():
@@ -200,8 +203,11 @@ def _fitted(
     if trainer.is_global_zero:
         final = f"train loss {float(train_loss):.4g}  " if train_loss is not None else ""
         echo(f"final: {final}{validation_line(found)}")
-        shared = _shared(model, data, trainer.world_size, bool(options["sync_batchnorm"]))
-        record = _exported(model, data, folder, chosen, errors, job, echo, shared)
+        speed = speed_of(trainer)
+        if speed is not None and speed.waiting > _MUCH_WAITING and data.sequences:
+            echo(f"{speed.waiting:.0%} of the training was spent waiting for frames: {_CURE}")
+        shared = shared_by(model, data, trainer.world_size, bool(options["sync_batchnorm"]))
+        record = _exported(model, data, folder, chosen, errors, job, echo, shared, speed)
         if shows:
             echo(opening(trainer.logger, output))
         sync_below(folder)  # run.json says that the rest is whole
@@ -219,6 +225,7 @@ def _exported(
     job: _Job,
     echo: Echo,
     shared: str,
+    speed: Speed | None,
 ) -> dict[str, object]:
     """Writes the model of the chosen checkpoint with its card, and returns what run.json is to say. `shared`: how
     processes shared the work, where there were several."""
@@ -228,7 +235,7 @@ def _exported(
     # Not the trainer's step: of processes started for the fit alone, it never hears.
     steps = int(torch.load(chosen.with_name(LAST), map_location="cpu", weights_only=True)["global_step"])
     card = TrainedCard(
-        trained_on=_trained_on(model, data) + shared,
+        trained_on=trained_on(model, data) + shared,
         rows=model.rows,
         steps=steps,
         seed=job.seed,
@@ -245,8 +252,10 @@ def _exported(
     save_model(exported.network, folder / "model.safetensors", card.record())
     output = output_of(folder) or folder
     write_whole(folder / "model.md", card.text(output.name))
-    told = [card.trained_on, f"{steps} steps, seed {job.seed}; the {chosen.stem} checkpoint."]
-    page = training_page(told, errors, card.chosen_by)
+    said = [card.trained_on, f"{steps} steps, seed {job.seed}; the {chosen.stem} checkpoint."]
+    if speed is not None:
+        said.append(f"Its speed, with validation left aside: {speed}.")
+    page = training_page(said, errors, card.chosen_by)
     if (batch := next(iter(data.val_dataloader()), None)) is not None:
         pictured = (folder / "uncertainty.png").read_bytes() if doubt is not None else None
         device = next(exported.network.parameters()).device
@@ -263,6 +272,7 @@ def _exported(
         "steps": steps,
         "units": {"rmse_mm": "mm", "medae_mm": "mm", "distance": "up to scale"},
         "errors": errors,
+        "timings": None if speed is None else speed.record(),
         "warnings": data.doubts,
         "colour": {echo.names.of(path): colours.record() for path, colours in data.colours.items()},
     }
@@ -347,54 +357,3 @@ def _set_calibration(network: DepthNetwork, fitted: Calibration) -> None:
     old = network.uncertainty.calibration
     new = torch.tensor([0.0, math.log(fitted.scale)]).to(old) + fitted.exponent * old
     network.uncertainty.calibration.copy_(new)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainedCard(Card):
-    """The card of a checkpoint that was trained from the start."""
-
-    fit: FitConfig
-    """how the run was watched, averaged and stopped"""
-    tube: TubeData | None
-    """synthetic colons that it was trained or validated on, if any"""
-
-    def record(self) -> dict[str, object]:
-        shared = super().record()
-        errors, version = shared.pop("errors"), shared.pop("version")
-        own = {
-            "fit": asdict(self.fit),
-            "uncertainty": self.uncertainty,
-            "tube": None if self.tube is None else asdict(self.tube),
-        }
-        return {**shared, **own, "errors": errors, "version": version}
-
-
-def _trained_on(model: LightDepth, data: FrameDataModule) -> str:
-    tube = data.tube
-    parts = [f"{len(data.sequences)} sequences{_of_split(data.split)}"] if data.sequences else []
-    if tube.scenes:
-        parts.append(f"{tube.scenes} synthetic colons of {tube.frames} frames each")
-    truth = "with true distance in the loss" if model.loss_config.supervised > 0 else "no truth in the loss"
-    if model.loss_config.uncertainty > 0:
-        truth += " of distance; the uncertainty head alone learned from true distance"
-    return f"{' and '.join(parts)}, {data.size[0]}x{data.size[1]} pixels; {truth}."
-
-
-def _shared(model: LightDepth, data: FrameDataModule, processes: int, synchronised: bool) -> str:
-    """A sentence on how processes shared the work; none where there was one."""
-    if processes == 1:
-        return ""
-    own = ""
-    if any(isinstance(layer, torch.nn.BatchNorm2d) for layer in model.modules()):
-        own = ", batch statistics of " + ("all together" if synchronised else "each one's own frames")
-    return f" {processes} processes, batches of {data.batch_size} in each{own}."
-
-
-def _of_split(split: str | None) -> str:
-    """The split's data set and name: comparisons are only between models of the same one."""
-    if split is None:
-        return ""
-    path = Path(split).resolve()
-    return (
-        f" of the split {path.parent.parent.name}/{path.stem}" if path.parent.name == "splits" else f" of {path.name}"
-    )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Callable, Iterator, Sequence, Sized
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -22,6 +24,13 @@ _KILLED = (
 _MOST_UNREAD = 20  # items one after another: no accident, but a mistake
 
 
+@dataclass
+class Waited:
+    """Seconds for which a process has waited for its frames; where it reads them itself, all that this takes."""
+
+    seconds: float = 0.0
+
+
 def loader(
     dataset: Dataset[FrameBatch],
     batch_size: int,
@@ -30,8 +39,9 @@ def loader(
     order: Sampler[int] | None = None,
     drop_last: bool = False,
     replacing: bool = True,
+    waited: Waited | None = None,
 ) -> DataLoader[FrameBatch]:
-    """Batches of a dataset whose items are batches of one, in an `order` or its own.
+    """Batches of a dataset whose items are batches of one, in an `order` or its own. `waited` grows with each of them.
 
     In the place of an item that cannot be read stands the next one that can, or, where not `replacing`, none: that
     batch is smaller. `left_out` is told of each, in this process. Raises, in this process too, InputError where a score
@@ -40,6 +50,7 @@ def loader(
     return _Loader(
         _Readable(dataset, replacing),
         left_out,
+        waited or Waited(),
         sampler=order,
         drop_last=drop_last,
         batch_size=batch_size,
@@ -112,14 +123,16 @@ def _collated(items: Sequence[_Item]) -> _Item:
 class _Loader(DataLoader[FrameBatch]):
     """Tells and raises in this process what is wrong with an item, wherever it was loaded."""
 
-    def __init__(self, dataset: _Readable, left_out: Callable[[InputError], None], **options: object) -> None:
+    def __init__(
+        self, dataset: _Readable, left_out: Callable[[InputError], None], waited: Waited, **options: object
+    ) -> None:
         super().__init__(dataset, **options)  # type: ignore[arg-type]  # what it gives is told apart below
-        self.left_out = left_out
+        self.left_out, self.waited = left_out, waited
 
     def __iter__(self) -> Iterator[FrameBatch]:  # type: ignore[override]  # Lightning asks for no more
         read, unreadable, failed = False, None, None
         try:
-            for batch, unread, failed in cast(Iterator[_Item], super().__iter__()):
+            for batch, unread, failed in self._timed():
                 if failed is not None:
                     break
                 for error in unread:
@@ -138,6 +151,14 @@ class _Loader(DataLoader[FrameBatch]):
         # queues are closed first, so that it waits for workers that nothing reaches.
         self._iterator = None
         raise failed or cast(InputError, unreadable)
+
+    def _timed(self) -> Iterator[_Item]:
+        begun = time.perf_counter()
+        items = cast(Iterator[_Item], super().__iter__())
+        for item in items:
+            self.waited.seconds += time.perf_counter() - begun
+            yield item
+            begun = time.perf_counter()
 
 
 def _outliving_a_signal(worker: int) -> None:

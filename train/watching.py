@@ -77,7 +77,7 @@ def with_callbacks(
     extra: list[pl.Callback] = [
         Board(board),
         Diagnosis(settings.diagnosis, data.names),
-        TrainingProgress(echo, every=report_every(steps)),
+        TrainingProgress(echo, report_every(steps), data.seconds_waited),
     ]
     if settings.patience > 0:
         assert monitor is not None

@@ -78,6 +78,18 @@ def _write_together(contents: Mapping[Path, Content], partial: Mapping[Path, Pat
                 _remove(unfinished)
 
 
+def write_remade(path: Path, content: bytes) -> None:
+    """A file that can be made anew, and that shows by itself whether it is whole: it is not waited for until it is on
+    the disk. Its folder has to be there; OSErrors are the caller's, and what killed runs left is not cleared."""
+    partial = _partial(path)
+    try:
+        partial.write_bytes(content)
+        os.replace(partial, path)
+    except BaseException:
+        _remove(partial)
+        raise
+
+
 @contextmanager
 def folders_for(outputs: Iterable[Path]) -> Iterator[None]:
     """Makes the folders that outputs are to be in; those that it made go where the block fails and leaves nothing."""

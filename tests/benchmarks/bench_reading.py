@@ -6,18 +6,16 @@ Both go through a DataLoader in turns, so that a busy machine slows them alike. 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from torch.utils.data import DataLoader, Dataset
+from training import write_c3vd_frames
 
-from lightdepth.datasets import open_sequence, write_c3vd
-from lightdepth.datasets.c3vd import C3VD
-from lightdepth.frame import Frame
-from train.datamodule import _Frames
+from lightdepth.datasets import open_sequence
+from train.frame_sets import Frames
 from train.loader import collate
 
 AT_LEAST = 0.8
@@ -40,21 +38,7 @@ class Bare(Dataset):
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory) -> Path:
-    """Textured frames with noise, about as large on disk as C3VD's (1.9 MB), with depth and poses."""
-    folder = tmp_path_factory.mktemp("bench") / "seq"
-    rng = np.random.default_rng(0)
-    smooth = cv2.resize(rng.uniform(0.2, 0.7, (40, 50, 3)), (1350, 1080), interpolation=cv2.INTER_CUBIC)
-    images = (np.clip(np.roll(smooth, 9 * i, 1) + 0.004 * rng.normal(size=smooth.shape), 0, 1) for i in range(FRAMES))
-    frame = Frame("0000_color", np.zeros((1080, 1350, 3), np.float32), C3VD)
-    pose = np.eye(4)
-    write_c3vd(
-        [
-            replace(frame, name=f"{i:04d}_color", image=image.astype(np.float32), true_world_from_cam=pose)
-            for i, image in enumerate(images)
-        ],
-        folder,
-    )
-    return folder
+    return write_c3vd_frames(tmp_path_factory.mktemp("bench") / "seq", FRAMES)
 
 
 def rates(loaders: list[DataLoader]) -> np.ndarray:
@@ -75,7 +59,7 @@ def test_frames_are_read_almost_as_fast_as_bare_images(sequence, workers, capsys
     options = {"batch_size": BATCH, "num_workers": workers, "persistent_workers": workers > 0}
     ours, area, linear = rates(
         [
-            DataLoader(_Frames(open_sequence(sequence), SIZE, "seq"), collate_fn=collate, **options),
+            DataLoader(Frames(open_sequence(sequence), SIZE, "seq"), collate_fn=collate, **options),
             DataLoader(Bare(files, cv2.INTER_AREA), **options),
             DataLoader(Bare(files, cv2.INTER_LINEAR), **options),
         ]

@@ -21,7 +21,8 @@ from lightdepth.models import DepthModel, NetworkModel
 from lightdepth.module import MIN_RAY_Z
 from lightdepth.reporting.report import number
 
-from ..datamodule import FrameDataModule, held_out_count
+from ..datamodule import FrameDataModule
+from ..frame_sets import held_out_count
 from ..running import trainer_of_one
 from .module import Adaptation
 from .wall_judge import WallErrors, WallJudge, compared

@@ -146,7 +146,10 @@ def _fit(module: Adaptation, data: FrameDataModule, steps: int, run: Run) -> Non
     if run.done("training"):
         module.network.load_state_dict(load_file(run.state / "trained.safetensors"))
         return
-    told = [Diagnosis(DiagnosisConfig(), data.names), TrainingProgress(run.log, report_every(steps))]
+    told = [
+        Diagnosis(DiagnosisConfig(), data.names),
+        TrainingProgress(run.log, report_every(steps), data.seconds_waited),
+    ]
     trainer = trainer_of_one(steps, told)
     trainer.fit(module, datamodule=data)
     if run.resumable:
