@@ -405,7 +405,11 @@ def seven_columns(path):
 
 
 @mistake(
-    "Lost the truth of a frame", "frames", "no depth for 1 of 3 frames, the first is frame 1", "whole?", refused=False
+    "Lost the truth of a frame",
+    "frames",
+    "no depth for 1 of 3 frames, the first is frame 1",
+    "complete?",
+    refused=False,
 )
 def missing_truth(path):
     (path / "truth" / "distance" / "000001.tiff").unlink()

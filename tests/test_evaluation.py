@@ -275,7 +275,7 @@ def test_predictions_without_a_true_frame_are_refused(tmp_path):
     with refused("the truth … or --common", found="1 match (frame 2), 2 do not (0, 1)"):
         judge_depth(folder, sequence(colon(0).frames[2:]))
     assert list(judge_depth(folder, sequence(colon(0).frames[2:]), common=True).judged.frames) == ["000002"]
-    with refused(found="no frame has valid true depth", cure="the first: 000000: no true depth"):
+    with refused(found="no frame has valid true depth", cure="the first reason: 000000: no true depth"):
         judge_depth(folder, sequence([replace(f, true_distance=None) for f in colon(0).frames]))
 
 

@@ -242,7 +242,7 @@ def test_settings_of_lightning_s_that_do_nothing_are_no_options_and_old_files_th
     shown = capsys.readouterr().out
     assert not any(f"--trainer.{name.replace('_', '-')}" in shown for name in gone)
     (tmp_path / "old.yaml").write_text(json.dumps({"trainer": {**gone, "max_steps": 77}}))
-    with warned("no more", "limit_test_batches") as said, pytest.raises(SystemExit) as stopped:
+    with warned("no longer exist", "limit_test_batches") as said, pytest.raises(SystemExit) as stopped:
         train(["--config", str(tmp_path / "old.yaml"), "--print_config"])
     assert stopped.value.code == 0 and len(said) == 1
     assert "max_steps: 77" in capsys.readouterr().out

@@ -46,7 +46,7 @@ def scale(
         found, under = asked.told()
         if not found.told and scales_in(folder):
             reasons = "; ".join(map(str, found.maps))
-            raise PartialFailure(f"no map has a figure: {reasons}. {folder} keeps the figures that it had")
+            raise PartialFailure(f"no map has a scale: {reasons}. {folder} keeps the figures that it had")
         for one in found.maps[0 if found.told else 1 :]:  # the first reason of a failure is in the last line
             (out.log if one.mm_per_unit is not None or not found.told else out.warn)(str(one))
         found.write_file(out.folder, "map units", under, asked.length_record(length))
