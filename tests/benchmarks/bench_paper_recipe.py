@@ -42,6 +42,8 @@ from lightdepth.tube.slam import SlamConfig, simulate_slam
 SEED, KEYFRAMES, NEW_POINTS = 402, 30, 60
 """A colon of 30 keyframes, each of which observes some 1000 points."""
 RIGID = AgreementConfig(on=False)
+HALF_A_VOXEL = 0.5
+"""Farthest, in the median, that a surface with one scale for each keyframe may be from the plain one."""
 
 
 @dataclass
@@ -68,7 +70,6 @@ class Plain:
     truncation: float
     far: float
     times: Times = field(default_factory=Times)
-    triangles: int = 0
 
     def __post_init__(self) -> None:
         self.o3d = native.open3d()
@@ -97,9 +98,7 @@ class Plain:
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         with self.times("extract"):
             made = self.grid.extract_triangle_mesh(weight_threshold=0.0)
-            found = made.vertex.positions.numpy(), made.triangle.indices.numpy()
-        self.triangles = len(found[1])
-        return found
+            return made.vertex.positions.numpy(), made.triangle.indices.numpy()
 
 
 def scale_by_loop(mapped: np.ndarray, predicted: np.ndarray) -> tuple[float, np.ndarray]:
@@ -190,7 +189,8 @@ def test_a_mesh_after_every_keyframe(colon):
         ours = told(name, times, len(played))
         print(f"    plain over it: {ratio(reference, ours)}")
         vertices = surfaces[0].dense.vertices
-        same(vertices, mesh, plain.voxel)
+        median = same(vertices, mesh, plain.voxel)
+        assert config.agreement.on or median <= HALF_A_VOXEL, name  # what is bent is another surface
 
 
 def test_one_mesh_at_the_end(colon):
@@ -213,7 +213,8 @@ def test_one_mesh_at_the_end(colon):
         steps = ", ".join(f"{s} {1000 * t / count:.1f}" for s, t in made.seconds.items())
         print(f"  {name:<44} {1000 * ours.wall / count:7.1f} {1000 * ours.cpu / count:7.1f}   ({steps}, by the clock)")
         print(f"    plain over it: {ratio(reference, ours)}")
-        same(made.dense.vertices, mesh, plain.voxel)
+        median = same(made.dense.vertices, mesh, plain.voxel)
+        assert (config.agreement.on and config.recipe == "full") or median <= HALF_A_VOXEL, name
 
 
 def test_a_map_that_grows(growing: int = 300):
