@@ -112,6 +112,9 @@ def test_a_map_is_made_to_judge_frames_that_have_neither_truth_nor_map(start, se
     assert record["criterion"] == "map" and record["word"] != "not judged" and record["anchor"] == 50
     by_truth = adapted(start, sequences / "truth", tmp_path / "true", steps=2, keep_worse=True)
     assert by_truth["criterion"] == "truth" and by_truth["anchor"] == 0
+    for run, what in (("run", "The same blocks of wall decided"), ("true", "The same held-out frames decided")):
+        for name in ("report.html", "model.md"):
+            assert what in (tmp_path / run / name).read_text(encoding="utf-8"), name
 
 
 def test_a_map_that_is_too_poor_to_judge_lets_the_network_be_held_near_its_start(start, sequences, tmp_path):

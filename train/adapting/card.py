@@ -37,7 +37,8 @@ class AdaptedCard(Card):
 
     def text(self, name: str) -> str:
         title, rest = super().text(name).split("\n", 1)
-        return f"{title}\n\n{self.verdict}.\n{rest}"
+        caution = f"\n{self.verdict.caution}.\n" if self.verdict.caution else ""
+        return f"{title}\n\n{self.verdict}.\n{caution}{rest}"
 
     def record(self) -> dict[str, object]:
         shared = super().record()

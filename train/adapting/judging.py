@@ -81,6 +81,17 @@ class Verdict:
     def better(self) -> bool:
         return self.word == "better"
 
+    @property
+    def caution(self) -> str:
+        """What the judge's numbers cannot say, in a sentence; empty where nothing judged."""
+        if self.criterion == "none":
+            return ""
+        what = "held-out frames" if self.criterion == "truth" else "blocks of wall"
+        return (
+            f"The same {what} decided whether the network is kept, so that the numbers of a kept one are a little too "
+            "good: for numbers to quote, run `evaluate` on a sequence that adapting never saw"
+        )
+
     def __str__(self) -> str:
         if self.criterion == "none":
             return f"Not judged: {self.why}"

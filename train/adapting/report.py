@@ -77,6 +77,8 @@ def page(
         columns.append([None, before.errors[name], after.errors[name]])
     names = ("closed form", f"start: {start.name}", "adapted")
     page.table(headers, [[name, *row] for name, row in zip(names, zip(*columns, strict=True), strict=True)])
+    if outcome.verdict.caution:
+        page.text(f"{outcome.verdict.caution}.")
     page.text(
         f"{module.learning} weights learned; anchor {module.anchor:g}, "
         f"{'half of each batch replayed' if module.replay else 'no replay'}; the map "
