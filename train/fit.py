@@ -52,7 +52,7 @@ from .folder import begin_in, first_process, has_checkpoint, training_folder
 from .going_on import settings_before, warn_of_length, warn_of_settings
 from .report import FILES, show_frames, training_page
 from .requeue import requeued
-from .running import NO_ROOT, quiet
+from .running import NO_ROOT, while_training
 from .trained_card import TrainedCard, shared_by, trained_on
 from .trainer_options import check_trainer_options
 from .watching import Echo, FitConfig
@@ -65,7 +65,7 @@ _FIT = FitConfig()
 T = TypeVar("T")
 
 
-@quiet()
+@while_training()
 def fit(
     model: LightDepth,
     data: FrameDataModule,

@@ -48,7 +48,7 @@ from ..ablation.rows import JudgedColons, Row, Settings
 from ..ablation.run import finished, say, train_all
 from ..ablation.table import HEADING, AblationTable, Result, write_table
 from ..parser import training_parser
-from ..running import quiet
+from ..running import while_training
 
 _OURS = ("ablation.md", "ablation.csv", "ablation.json", INPUTS, "run.json")
 
@@ -144,7 +144,7 @@ def _ablate(
     todo = [plan for plan in plans if finished(plan) is None]
     say(f"{counted(len(plans), 'training')}, {len(plans) - len(todo)} of them already there")
     if todo:
-        with quiet():
+        with while_training():
             train_all(parser, todo, Judge(judged, common.tube, common.size))
     results = [finished(plan) for plan in plans]
     made = AblationTable(

@@ -38,7 +38,7 @@ from ..adapting.target import Target, adaptation, frame_data, read_target, repla
 from ..adapting.wall_judge import compared, wall_judge
 from ..callbacks import Diagnosis, DiagnosisConfig, TrainingProgress
 from ..datamodule import FrameDataModule
-from ..running import quiet, report_every, trainer_of_one
+from ..running import report_every, trainer_of_one, while_training
 
 
 def adapt(
@@ -97,7 +97,7 @@ def adapt(
     start = load_called(checkpoint, details=False)
     if not isinstance(start, NetworkModel):
         raise InputError("--checkpoint", f"{checkpoint} has no weights to adapt", "expected a trained checkpoint")
-    with quiet(), run_folder(output, "adapt", arguments, overwrite, resume) as run:
+    with while_training(), run_folder(output, "adapt", arguments, overwrite, resume) as run:
         run.hash_inputs(**source.files, map=map, checkpoint=Path(checkpoint))
         target = read_target(run, source, map, fit_light, config, start, sfm, pairing, more)
         size = config.size or working_size(target.frames.first().camera, start.rows)
