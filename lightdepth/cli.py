@@ -22,6 +22,7 @@ from lightdepth import __version__
 from lightdepth.command_line.dry import DRY, Planned
 from lightdepth.command_line.outcome import Outcome, in_turn, manners, outcome, planned, speaking
 from lightdepth.command_line.own_packages import own_packages_first
+from lightdepth.command_line.own_process import set_own_process
 from lightdepth.command_line.pipes import fill_closed_streams, outliving_readers
 from lightdepth.command_line.verbs import all_verbs, summary_of, verb_parser
 from lightdepth.command_line.warned import warnings_as_sentences
@@ -36,10 +37,6 @@ from lightdepth.errors import (
 from lightdepth.foreign_text import for_line
 from lightdepth.signals import ending_on_signals
 
-ONE_THREAD = "OPENBLAS_NUM_THREADS", "1"
-"""The systems that are solved are many and small. Threads of each would wait for each other, for long where a container
-or other work leaves fewer cores than the machine has."""
-
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one verb. Exit codes: 0 done, 2 wrong usage, 3 bad input, 4 part of the work failed, 5 the machine failed
@@ -47,7 +44,7 @@ def main(argv: list[str] | None = None) -> int:
     each other."""
     fill_closed_streams()
     if argv is None:  # a process of its own, in which nothing is loaded yet
-        os.environ.setdefault(*ONE_THREAD)
+        set_own_process()
     call, given = manners(sys.argv[1:] if argv is None else argv)
     call.version = __version__
     with in_turn(call):

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from multiprocessing import connection, get_context, parent_process
 from typing import Any, Generic, TypeVar
 
+from lightdepth.command_line.own_process import set_own_process
 from lightdepth.errors import Interrupted
 from lightdepth.signals import ending_on_signals, finishing_first
 
@@ -122,6 +123,7 @@ def _end(hands: Iterable[_Hand[Any]]) -> None:
 
 def _be_one(start: Callable[[], Callable[[Any], Any]], line: Any, threads: int) -> None:
     """The life of a process."""
+    set_own_process()
     threading.Thread(target=_die_with_parent, daemon=True).start()
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)  # libraries that write there themselves
