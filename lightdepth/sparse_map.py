@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from lightdepth.brief import Brief
 from lightdepth.camera import CameraModel, Provenance
@@ -214,11 +215,12 @@ def _moved(submap: Submap, by: np.ndarray) -> Submap:
 
 def covisibility(submap: Submap) -> np.ndarray:
     """How many points each pair of keyframes shares, (n, n) int with each keyframe's own count on the diagonal."""
-    seen = np.zeros((len(submap.keyframes), len(submap.points)), np.int32)
-    for row, keyframe in enumerate(submap.keyframes):
-        ids = submap.observed_points(keyframe)[0]
-        seen[row, submap.rows_of(ids)[0]] = 1
-    return seen @ seen.T
+    rows = [submap.rows_of(submap.observed_points(keyframe)[0])[0] for keyframe in submap.keyframes]
+    ends = np.cumsum([0, *map(len, rows)])
+    ones = np.ones(ends[-1], np.int32)
+    seen = csr_matrix((ones, np.concatenate(rows), ends), (len(rows), len(submap.points)))
+    shared: np.ndarray = (seen @ seen.T).toarray()
+    return shared
 
 
 def typical_distance(submap: Submap) -> float:

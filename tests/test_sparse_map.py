@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -88,6 +89,22 @@ def test_covisibility_counts_the_points_that_two_keyframes_share():
     assert covisibility(whole).tolist() == [[10, 9, 8], [9, 9, 8], [8, 8, 8]]
     sets = [set(whole.observed_points(k)[0].tolist()) for k in whole.keyframes]
     assert covisibility(whole).tolist() == [[len(a & b) for b in sets] for a in sets]
+
+
+def test_covisibility_of_a_long_map_needs_no_table_of_every_keyframe_and_point():
+    """Nor the time for one: a map of 2000 keyframes took more than a quarter of an hour."""
+    rng, one = np.random.default_rng(0), submap(4, 1).keyframes[0]
+    keyframes = [
+        replace(one, name=f"{k:06d}", point_ids=np.arange(300 * k, 300 * k + 600), pixels=rng.uniform(0, 9, (600, 2)))
+        for k in range(300)
+    ]
+    whole = Submap(0, tuple(keyframes), np.arange(100_000), rng.normal(size=(100_000, 3)))
+    tracemalloc.start()
+    shared = covisibility(whole)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 300 * 100_000
+    np.testing.assert_array_equal(shared, 600 * np.eye(300) + 300 * (np.eye(300, k=1) + np.eye(300, k=-1)))
 
 
 @pytest.mark.parametrize("seed", range(3))
