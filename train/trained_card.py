@@ -7,7 +7,10 @@ from pathlib import Path
 
 import torch
 
+from lightdepth.checkpoint import HUB, bundled
 from lightdepth.module import LightDepth
+from lightdepth.network.pretrained import IMAGENET
+from lightdepth.reporting.same import input_hash
 
 from .card import Card
 from .colons import TubeData
@@ -43,7 +46,21 @@ def trained_on(model: LightDepth, data: FrameDataModule) -> str:
     truth = "with true distance in the loss" if model.loss_config.supervised > 0 else "no truth in the loss"
     if model.loss_config.uncertainty > 0:
         truth += " of distance; the uncertainty head alone learned from true distance"
-    return f"{' and '.join(parts)}, {data.size[0]}x{data.size[1]} pixels; {truth}."
+    return f"{' and '.join(parts)}, {data.size[0]}x{data.size[1]} pixels; {truth}.{_began_with(model)}"
+
+
+def _began_with(model: LightDepth) -> str:
+    """What others trained, in a sentence, and thereby which images it saw besides; a file is told by its hash, as its
+    name may be a patient's."""
+    said = ""
+    if model.pretrained is not None:
+        what = "ImageNet" if model.pretrained == IMAGENET else f"the file {input_hash(Path(model.pretrained))[:8]}"
+        said = f" Its encoder began with the weights of {what}."
+    if model.start is not None:
+        named = model.start in bundled() or model.start.startswith(HUB)
+        what = model.start if named else f"the checkpoint {input_hash(Path(model.start))[:8]}"
+        said += f" All its weights began with those of {what}."
+    return said
 
 
 def shared_by(model: LightDepth, data: FrameDataModule, processes: int, synchronised: bool) -> str:
