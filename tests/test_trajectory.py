@@ -222,6 +222,11 @@ def test_a_multi_map_tree_brings_every_localised_frame(tmp_path):
     # The map's own keyframes are among them, with the map's poses; frames in between have the poses given.
     assert [t.id for t in found] == [0, 1] and all(t.whole for t in found)
     assert found[0].keyframe.sum() == len(export.map.submaps[0].keyframes) < len(found[0].numbers)
+    true = {f.number: f.true_world_from_cam[:3, 3] for f in frames}
+    between = ~found[0].keyframe
+    np.testing.assert_allclose(
+        found[0].centers[between], [true[n] for n in found[0].numbers[between].tolist()], atol=1e-6
+    )
     summary = trajectory_summary(
         [align_trajectory(t, {f.number: f.true_world_from_cam for f in frames}) for t in found], found, range(10)
     )
