@@ -4,8 +4,9 @@
 
 The benchmark's eight short colons (densify.bench.scenes, at most 24 keyframes of 160x128) from two first seeds that
 nothing was tuned on (400, 500; LIGHTDEPTH_FIRST_SEEDS takes others: 710 and 718 were tuned on), each with 10 and 45 %
-wrong points and, of every second colon, a map like a real SLAM's whose points err together. Made dense with the default
-network and settings. A vertex's error is its distance from the true wall, mm, where the map truly stands. Of each map:
+wrong points and, for every second colon, maps like a real SLAM's, whose points err together. They were made dense with
+the default network and settings. A vertex's error is its distance from the true wall, mm, with the map put where it
+truly is. For each map:
 
     order     rank correlation of confidence with the error
     green     share of the vertices that count as seen well

@@ -10,10 +10,11 @@ stood, the trajectories brought together by a similarity, and e_1 that of the sa
 
     green: e <= 5 % and e <= 1.2 e_1      red: e > 10 % or e > 1.5 e_1      amber: what is between.
 
-RMS is that of the rays that all meet, or the one that sees less would win. Drift of scale stands apart: no image can
-see it. What `densify` says of frames and map before it begins is there too: where it refuses, the verdict is what a
-user gets who says --trust-map, and a pairing that is wrong or doubtful is never green. What of the wall was
-seen well stands in the headline beside the colour, which says nothing of it.
+RMS is over the rays that meet all three surfaces; otherwise a surface that covers less would win. Drift of scale has a
+table of its own: no image can see it. "Own number" is the error that the run itself states. "Frames and map" is what
+`densify` says of them before it begins. Where it refuses, the verdict is the one that a user gets with --trust-map;
+where frames and map are wrong or doubtful together, it is never green. How much of the wall was seen well is in the
+headline beside the colour; the colour says nothing about it.
 
 LIGHTDEPTH_VERDICT=docs/verdict.md writes the tables there; LIGHTDEPTH_SCENES takes other colons, in sixes, as "710
 711 712 713 714 715", to tune on.
@@ -253,7 +254,7 @@ def test_the_verdict_and_the_number_order_runs_as_truth_does():
     begun = [r for r in rows if r.pairing != "wrong"]
     red, amber, green = ([r for r in rows if r.truth == c] for c in ("red", "amber", "green"))
     said = [
-        f"Rank correlation of the own number with the true error: {correlation(rows):.2f} over all, "
+        f"Rank correlation of the run's own number with the true error: {correlation(rows):.2f} over all, "
         f"{correlation(coherent):.2f} within those that err together; {correlation(begun):.2f} over the {len(begun)} "
         f"whose frames and map are not refused.",
         f"Called amber: {sum(r.colour == 'amber' for r in rows)} of 40. Red called green: "
