@@ -35,8 +35,8 @@ class AlignmentConfig:
     ratio with the least median of squared residuals, median the median ratio. median is never refined (refine, loss),
     and serves to compare with."""
     t: Annotated[float, above(0)] = 2.5
-    """Number of sigmas (sigma is the robust standard deviation of what lies between a keyframe's map points and its
-    scaled depth) within which a map point counts as right, an inlier. A larger one takes in more points, wrong ones
+    """Number of sigmas (sigma is the robust standard deviation of the differences between a keyframe's map points and
+    its scaled depth) within which a map point counts as right, an inlier. A larger one takes in more points, wrong ones
     among them."""
     finite_sample: bool = False
     """Whether sigma is widened by Rousseeuw's factor 1 + 5 / (n - 1), n the keyframe's number of points. Switched on,
@@ -45,8 +45,8 @@ class AlignmentConfig:
     """Whether the scale found by lmeds, which is the ratio of a single point, is refined on all inliers by robust least
     squares; switched off, it stays as found. With the estimator median it does nothing."""
     loss: Loss = "geman_mcclure"
-    """Robust loss of that refinement: geman_mcclure, huber, cauchy or tukey. An inlier that is off by 2.5 sigmas keeps
-    a weight of 0.02 with geman_mcclure, and of about 0.5 with each of the others."""
+    """Robust loss of the refinement (see refine): geman_mcclure, huber, cauchy or tukey. An inlier that is off by 2.5
+    sigmas keeps a weight of 0.02 with geman_mcclure, and of about 0.5 with each of the others."""
     min_points: Annotated[int, COUNT] = 8
     """Least number of map points, observed where the model predicts a distance, that a keyframe needs; one with fewer
     is left out of the surface. More make scales safer and leave out more keyframes."""

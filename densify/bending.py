@@ -39,28 +39,29 @@ class BendingConfig:
     """Number n of smooth bumps across and down the image that make up the bend, n x n of them, at least 2; several
     numbers lay several such grids over each other. More let depth bend in finer detail."""
     finer: Annotated[int, at_least(0, up_to=64)] = 9
-    """Number n of bumps across and down, n x n, of one more grid, which the bends of a submap get as far as the images
-    speak for what it adds (judge.parallax): a map whose points are right bends depth in finer detail than one whose
-    points err together. More follow points more closely and take longer, at least 2; 0 leaves it out, and live always
-    does."""
+    """Number n of bumps across and down, n x n, of one more grid, at least 2. The bends of a submap use it as far as
+    the images confirm what it adds (judge.parallax). So a map whose points are right bends depth in finer detail than
+    one whose points err together. More follow points more closely and take longer; 0 leaves the grid out, and live
+    always does."""
     slope_deviation: Annotated[float, at_least(0)] = 0.25
     """How strongly the factor on distance is expected to change with distance itself (standard deviation, a ratio:
-    change of the factor's log per change of the log of predicted distance), besides over the image; a soft limit, 0
-    for no such change. A larger one lets near wall be stretched against far wall more freely."""
+    change of the factor's log per change of the log of predicted distance), in addition to its change over the image; a
+    soft limit, 0 for no such change. A larger one lets near wall be stretched against far wall more freely."""
     bump_deviation: Annotated[float, at_least(_LEAST)] = 0.1
     """Expected size (standard deviation) of each bump of the bend, in log distance (0.1 is 10 %). A larger one
     lets depth bend more strongly."""
 
     layers: Annotated[int, at_least(0, up_to=64)] = 7
     """Number of smooth bumps over log distance, `reach` apart, around a keyframe's median predicted distance, that the
-    bend has besides those over the image: near wall and far wall bend each by its own points. More cover nearer and
+    bend has besides those over the image: near wall and far wall each bend by their own points. More cover nearer and
     farther wall; 0 leaves them out."""
     columns: Annotated[int, at_least(0, up_to=64)] = 3
     """Number n of bumps across and down the image, n x n, that each layer has of its own, so that what is near and what
     is far in one part of the image bend apart. More bend in finer detail and take longer; 0 leaves them out."""
     reach: Annotated[float, above(0)] = 0.35
-    """Step, in log distance (0.35 is a factor of 1.4), from layer to layer, and how far wall has to be from points in
-    distance to keep the network's own shape. A larger one makes a smoother bend, which reaches farther from points."""
+    """Step, in log distance (0.35 is a factor of 1.4), from layer to layer, and how far, in distance, wall has to be
+    from points to keep the network's own shape. A larger one makes a smoother bend, which reaches farther from
+    points."""
     layer_deviation: Annotated[float, at_least(_LEAST)] = 0.1
     """Expected size (standard deviation) of each bump of a layer, in log distance (0.1 is 10 %). A larger one lets near
     wall bend more strongly against far wall."""

@@ -93,8 +93,8 @@ class DensifyConfig(OfflineConfig):
     """How dense maps are made: full, with all steps below, or paper, as published: one LMedS scale per keyframe, one
     undistorted pinhole image, a plain TSDF. To what is published, paper adds the gates of alignment, which leave out
     keyframes whose scale is unsure, and fusion.far, beyond which nothing is fused; report and run.json list them, with
-    the values that open them. It refuses settings of agreement, bending, contradiction and rectify, which it has not,
-    and ignores coverage, gate.on, fusion.min_views, fusion.front and fusion.max_error."""
+    the values that open them. It refuses settings of agreement, bending, contradiction and rectify, which it does not
+    have, and ignores coverage, gate.on, fusion.min_views, fusion.front and fusion.max_error."""
     keep_mb: Annotated[float, at_least(0)] = 1000.0
     """Memory, megabytes, for the images and predictions of a submap that are kept from one pass over it to the next;
     what does not fit is read and predicted again. More save time and change nothing else."""

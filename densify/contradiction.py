@@ -46,10 +46,10 @@ class ContradictionConfig:
     contradict the other. A larger one leaves out fewer pixels."""
     judges: Annotated[int, at_least(1, up_to=1000)] = 8
     """Number of other keyframes that each keyframe is compared with, chosen evenly in time among those that share map
-    points with it. More let more of its pixels be compared, so more may be removed, and take longer."""
+    points with it. More compare more of its pixels, so that more may be left out, and take longer."""
     samples: Annotated[int, at_least(1, up_to=10_000)] = 80
     """Number of pixels across the image that are compared, and in proportion down; each speaks for the cell around it.
-    More tell the edges of what is left out more finely and take longer."""
+    More find the edges of what is left out more finely and take longer."""
 
 
 def uncontradicted(

@@ -36,14 +36,14 @@ class CoverageConfig:
     """Least number of keyframes that must have seen a piece of wall for the report to call it seen well; the surface
     stays as it is. More make less wall count as seen well."""
     weight: Annotated[float, at_least(0)] = 1.0
-    """Least sum of the weights of all looks at a piece of wall for it to be called seen well: a keyframe looking
-    straight at lit wall counts 1, a slanted, dark, saturated or uncertain look less. A larger one makes less wall count
-    as seen well."""
+    """Least sum of the weights of all keyframes that see a piece of wall, for it to be called seen well: one that looks
+    straight at lit wall counts 1, and a slanted, dark, saturated or uncertain view less. A larger one makes less wall
+    count as seen well."""
     error: Annotated[float, at_least(0)] = DOUBTED
-    """Largest error that may be expected of a vertex, as a share of the distance of a typical inlier. A
-    larger one calls more wall seen well, and more of it is wrong."""
+    """Largest expected error of a vertex for it to be called seen well, as a share of the distance of a typical inlier.
+    A larger one calls more wall seen well, and more of it is wrong."""
     min_voxels: Annotated[float, at_least(0)] = 5.0
-    """Side of a square, in voxels: holes and weakly seen patches of a smaller area than its are not listed in the
+    """Side of a square, in voxels: holes and weakly seen patches smaller than this square in area are not listed in the
     report. A larger one lists fewer."""
 
 

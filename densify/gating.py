@@ -19,12 +19,12 @@ class GateConfig:
     """Which keyframes are doubted for depth, and what becomes of them."""
 
     on: bool = False
-    """Whether keyframes whose depth is doubted are left out of the surface, unless these are more than half of a
-    submap's, which helps where smoke or clipping spoils many; switched off, they are fused like others, and only named.
-    The recipe paper leaves none out."""
+    """Whether keyframes with doubtful depth are left out of the surface, unless they are more than half of a submap's.
+    It helps where smoke or clipping spoils many. Switched off, they are fused like others, and only named. The recipe
+    paper leaves none out."""
     contrast: Annotated[float, at_least(1, up_to=1000)] = DepthGate.contrast
-    """Least ratio of a keyframe's bright to its dark light (90th to 10th percentile, linear) with which its depth is
-    not doubted; smoke and clipping lower it. A larger one doubts more keyframes."""
+    """Ratio of a keyframe's bright to its dark light (90th to 10th percentile, linear) below which its depth is
+    doubtful; smoke and clipping lower it. A larger one doubts more keyframes."""
 
     def doubt(self, frame: Frame | None) -> str:
         """Why a keyframe's depth is doubted; empty where it is not, or its image is not there."""

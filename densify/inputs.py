@@ -50,12 +50,12 @@ class SurfaceFiles:
     """Formats of the mesh files to write: ply, which must be among them, and besides it glb and obj if wanted."""
     mm_per_unit: Annotated[float | Literal["light"] | None, above(0)] = None
     """Millimetres per map unit, where known: lengths and surfaces are then written in mm, else in map units. It is one
-    factor for all submaps, right for those that share a unit. A larger one makes a larger surface. The word light asks
-    the light beside the lens for each submap's own, with an interval; where it tells none, surfaces stay in map
-    units."""
+    factor for all submaps, right for those that share a unit. A larger one makes a larger surface. The word light finds
+    each submap's own factor, with an interval, from the light beside the lens; where it finds none, surfaces stay in
+    map units."""
     wall_mm: Annotated[float, above(0)] = WALL_MM
-    """Distance of the wall, mm, in the median, for --mm-per-unit light: scales are looked for that make it .4 to 2.5
-    times this. A larger one looks for larger scales."""
+    """Median distance of the wall, mm, that --mm-per-unit light starts from: it tries scales that make the distance 0.4
+    to 2.5 times this. A larger one looks for larger scales."""
 
     def __post_init__(self) -> None:
         if "ply" not in self.formats:
@@ -71,11 +71,11 @@ class MapSource(PairingConfig):
     map, or a TUM trajectory with points; left out, pycolmap makes one from the frames."""
     repair_map: bool = False
     """Make the map anew before it is used, by matching the images of its keyframes, beginning at its poses and keeping
-    its frame and scale; written to sparse/ in the run folder. Switched off, it is used as it is."""
+    its coordinates and scale; written to sparse/ in the run folder. Switched off, it is used as it is."""
     polish_map: bool = False
-    """Put keyframes whose poses stray from the map's own points where these see them, each only where hidden blocks of
-    points bear it out, and before repair_map. A map of which some moved is written to polished/ in the run folder, in
-    its frame and scale. Switched off, poses stay as they are."""
+    """Move keyframes whose poses disagree with the map's own points to where these points put them, each only if hidden
+    blocks of points confirm it; this is done before repair_map. Where any moved, the map is written to polished/ in the
+    run folder, in its old coordinates and scale. Switched off, poses stay as they are."""
 
     @classmethod
     def read_as(cls, map: Path, reading: MapReading, trust_map: bool = False, repair_map: bool = False) -> MapSource:
@@ -214,7 +214,7 @@ def doubts_of_inputs(run: Run, sparse_map: SparseMap, frames: FrameSequence) -> 
     cameras = _uncertain_cameras(sparse_map)
     for known in cameras:
         run.warn_once(known.doubt)
-    run.log("colours: those of the keyframes are checked")
+    run.log("colours of the keyframes are checked")
     row_of = {number: row for row, number in enumerate(frames.numbers)}
     keyframes = [row_of[k.number] for s in sparse_map.submaps for k in s.keyframes if k.number in row_of]
     colours = colours_of(frames, keyframes)

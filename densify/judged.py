@@ -48,7 +48,7 @@ from lightdepth.sparse_map import SparseMap
 @dataclass(frozen=True)
 @checked
 class TruthSource:
-    """What is judged against, and how it is read."""
+    """The truth to judge by, and how it is read."""
 
     truth: Path | None = None
     """Folder of the sequence with true depth (and, to judge maps, true poses); left out, a densify run is judged by its
@@ -65,12 +65,12 @@ class TruthSource:
     """Light of the endoscope by which --checkpoint predicts: a light.json, a photometric XML, or values such as
     gamma=2.2,mu=0. Left out, that of the truth's folder, else one fitted on each map (see --fit-light)."""
     bit_depth: Annotated[int | None, Range(8, 32)] = None
-    """Bits of a sample in the truth's pictures that are stored in more than 8; left out, what the files say, else what
-    their highest values show. A larger one reads the same numbers as darker."""
+    """Bits per sample of the truth's pictures that have more than 8; left out, it is read from the files, else told by
+    their highest values. A larger one reads the same numbers as darker."""
     truth_mesh: Path | None = None
-    """Mesh file (PLY, OBJ, STL or GLB) of the true surface, in mm and in the frame of the true poses, for the figure
-    "to true mesh" of surfaces alone: precision and recall stay by true depth, without which it is not used. Left out,
-    C3VD's own where it lies beside the frames, else one made of true depth."""
+    """Mesh file (PLY, OBJ, STL or GLB) of the true surface, in mm and in the frame of the true poses, only for the
+    figure "to true mesh" of surfaces: precision and recall still come from true depth, without which the mesh is not
+    used. Left out, C3VD's own mesh where it lies beside the frames, else one made from true depth."""
 
     def sequence(self, folder: Path) -> SequenceSource:
         """A folder of the truth: itself, or one of its sequences."""
@@ -80,7 +80,7 @@ class TruthSource:
 @dataclass(frozen=True)
 @checked
 class JudgingConfig(MapReading):
-    """How errors are taken."""
+    """How errors are measured."""
 
     mm_per_unit: Annotated[float | None, above(0)] = None
     """Millimetres per map unit, where known, for the trajectory's error after SE(3), that is without fitting its scale;
@@ -98,7 +98,8 @@ class JudgingConfig(MapReading):
     """Judge even by truth that contradicts its own poses by more than 2 %, or whose unit is unlikely to be millimetres;
     switched off, that is an error."""
     trust_map: bool = False
-    """Go on with a map whose frames, by their images, are others than those that it was made of, and only warn."""
+    """Where the images say that the map was made from other frames than these, only warn and go on; switched off, that
+    is an error."""
 
     def __post_init__(self) -> None:
         if not self.thresholds_mm:

@@ -33,10 +33,10 @@ class LengthGiven:
     """Two places in the coordinates of a map's surface, map units, [[x, y, z], [x, y, z]], whose straight distance is
     known; on the surface or near it (`measure` says where it is). Another pair is of another length."""
     mm: Annotated[float | None, above(0)] = None
-    """Their distance, mm. A longer one makes the map larger in proportion."""
+    """Distance between the two places, mm. A longer one makes the map larger in proportion."""
     error_mm: Annotated[float | None, above(0)] = None
-    """Standard error of that distance, mm, of the places too, below it; left out, a tenth of it. A larger one gives the
-    light more weight beside it."""
+    """Standard error of that distance, mm, in which the error of the places counts too; it must be below the distance.
+    Left out, a tenth of it. A larger one gives the light more weight beside it."""
     map: Annotated[int | None, at_least(0)] = None
     """Number of the map that the places are on, as in the name of its folder; needed where the run has several. Another
     one gives that map's unit."""

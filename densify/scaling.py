@@ -41,7 +41,7 @@ WALL_MM = 30.0
 
 @dataclass(frozen=True, eq=False)
 class SeenMap:
-    """A dense map's surface and the keyframes that it was made of, in the same unit."""
+    """A dense map's surface and the keyframes that it was made from, in the same unit."""
 
     id: int
     surface: Surface

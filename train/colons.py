@@ -47,15 +47,15 @@ class TubeData:
     and 1 is linear. A larger one brightens dark parts more."""
     reflectance: Annotated[tuple[float, float], ends_of(BELOW_ONE)] = (0.0, 0.7)
     """Range [low, high] from which each colon's reflectance is drawn, the share of light, in [0, 1), that its wall
-    throws back onto other wall. A larger one makes more indirect light."""
+    reflects onto other wall. A larger one makes more indirect light."""
     family: Family = "plain"
     """Kind of colons: plain, tubes with folds under the endoscope's light; realistic, with polyps, mucus, motion blur
-    and whatever else real images have; mixed, as realistic, but one scene of five is a hollow of any form instead, and
+    and whatever else real images have; mixed, as realistic, but one scene of five is a cavity of any shape instead, and
     each has a round or eight-sided field of view of its own; wide, as mixed, over wider ranges of shape, paint and
-    exposure, with the light between walls reckoned in another way from colon to colon."""
+    exposure, with the light between walls computed in a way that changes from colon to colon."""
     val_family: Family | Literal["variant"] | None = None
-    """Kind of colons to validate on, and to set the size of the uncertainty by: one of the families, or variant, of
-    another make than any that is trained on. Left out, that of those to train on."""
+    """Kind of colons to validate on, and to scale the uncertainty by: one of the families, or variant, which is made in
+    another way than all of them. Left out, the kind that is trained on."""
     scene: TubeConfig | None = None
     """Ranges that the colons are drawn from, in place of those of the family: a mapping in a --config file, or
     --data.tube.scene.shape.length 150 and the like, named as below --scene in `lightdepth synth --help-all`. mu, gamma

@@ -70,8 +70,8 @@ class FrameData:
     """Image, white where tissue shows and black elsewhere, for all the sequences in place of their own masks. Left out,
     each has its own, if any."""
     bit_depth: Annotated[int | None, Range(8, 32)] = None
-    """Bits of a sample in pictures that are stored in more than 8, of all the sequences; left out, what the files say,
-    else what their highest values show. A larger one reads the same numbers as darker."""
+    """Bits per sample of pictures that have more than 8, in all the sequences; left out, it is read from the files,
+    else told by their highest values. A larger one reads the same numbers as darker."""
     held_out: Annotated[float, BETWEEN] = 0.1
     """Share of each training sequence, above 0 and below 1, at its end, that validates and teaches nothing, where no
     validation sequences are given. A larger one judges more surely and trains on less."""
@@ -79,8 +79,8 @@ class FrameData:
     """Synthetic colons to train and validate on, besides the sequences or alone."""
     halves: bool = False
     """true: one half of each batch is frames of the sequences, the other of synthetic colons (of an odd number the
-    sequences have one more). false: all are shuffled together, so that there are most of what has most frames. Without
-    both kinds it changes nothing."""
+    sequences have one more). false: all are shuffled together, so that the kind with more frames has the larger part.
+    Without both kinds it changes nothing."""
     size: Annotated[tuple[int, int], at_least(16, up_to=10_000)] = (160, 128)
     """Width and height that the images are resized to, pixels, to train, validate and predict at. A larger one shows
     finer detail and takes longer."""
@@ -89,23 +89,23 @@ class FrameData:
     and memory."""
     num_workers: Annotated[int, at_least(0, up_to=1024)] = 0
     """Number of extra processes that read frames; with 0 the main one reads them itself, between steps. More read
-    faster, as far as there are cores."""
+    faster, up to the number of cores."""
     cache: bool | str = False
-    """Folder in which frames are kept once they are decoded, at the size that they are trained at, for all epochs and
-    later runs: some 1.5 MB each at 320x256, pictures of patients where the frames are. true: a folder of your own,
-    below ~/.cache or XDG_CACHE_HOME. false: they are decoded each time. It changes the time, and no result."""
+    """Folder in which decoded frames are kept, at the size of training, for all epochs and later runs: some 1.5 MB each
+    at 320x256. They are pictures of patients where the frames are. true: a folder of your own, below ~/.cache or
+    XDG_CACHE_HOME. false: frames are decoded each time. It changes the time, and no result."""
     augment: bool = True
     """true: training images are flipped at random, and made brighter or darker by some 10 %. false: they are shown as
     they are. Validation images are never changed."""
     reflectance_error: Annotated[float, Range(-1, 1)] = 0.0
-    """Number added to the known reflectance of each image (the share of light that the wall throws back; the sum is
-    kept in [0, 0.95]), to try what a wrong calibration costs; 0 adds nothing. A larger one makes it more wrong. Only
-    --model.loss.reflectance null, or reflectance among --model.network.inputs, lets it have an effect."""
+    """Number added to the known reflectance of each image (the share of light that the wall reflects onto other wall;
+    the sum is kept in [0, 0.95]), to see what a wrong calibration costs; 0 adds nothing. A larger one makes it more
+    wrong. Only --model.loss.reflectance null, or reflectance among --model.network.inputs, lets it have an effect."""
     random_reflectance: Annotated[tuple[float, float] | None, ends_of(BELOW_ONE)] = None
-    """Range [low, high] of shares in [0, 1), from which the reflectance told of each training image (the share of light
-    that the wall throws back) is drawn anew in every step; left out, the known one is told. A larger one tells of more
-    indirect light. Like reflectance_error, it acts through --model.loss.reflectance null or the network's input
-    alone."""
+    """Range [low, high] of shares in [0, 1), from which the reflectance that is stated for each training image (the
+    share of light that the wall reflects onto other wall) is drawn anew in every step; left out, the known one is
+    stated. A larger one states more indirect light. Like reflectance_error, it has an effect only through
+    --model.loss.reflectance null or the network's input."""
     seed: Annotated[int, SEED] = 0
     """Number that draws colons, order and augmentation. Another one makes another run."""
 

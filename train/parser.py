@@ -20,8 +20,8 @@ _OUTPUT = "Folder of the run to make: checkpoints, model.safetensors, logs and r
 _RESUME = """Go on with the run in OUTPUT from its checkpoints/last.ckpt, with its own config.yaml where no other is
 given. Without it, a folder that holds a run is refused."""
 _OVERWRITE = "Replace the run in OUTPUT by a new one. Without it, a folder that holds a run is refused."
-_SEED = """Number that all chance follows from: first weights, synthetic colons, order of frames and augmentation.
-Another one makes another run, better or worse by chance alone."""
+_SEED = """Number that seeds all randomness: first weights, synthetic colons, order of frames and augmentation. Another
+one makes another run, better or worse by chance alone."""
 
 
 def training_parser() -> Parser:

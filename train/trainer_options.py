@@ -29,9 +29,9 @@ class TrainerSettings:
         "ddp_find_unused_parameters_false",
         "fsdp",
     ] = "auto"
-    """How several devices share the work: ddp (each has a copy of the network and frames of its own), by processes that
-    are started anew, or by ddp_spawn or ddp_fork otherwise; fsdp, which parts the network, too; auto lets Lightning
-    choose."""
+    """How several devices share the work: ddp (each has a copy of the network and frames of its own), in newly started
+    processes; ddp_spawn and ddp_fork, the same in processes started in other ways; fsdp, which also splits the network;
+    auto lets Lightning choose."""
     devices: Annotated[list[int] | str | int, at_least(-1, up_to=100_000)] = "auto"
     """Number of devices to train on, or a list of the numbers of those to take, such as [0, 2]; auto takes all. More
     are faster, and each adds its own batch to every step."""
@@ -68,7 +68,7 @@ class TrainerSettings:
     all. More judge more surely and take longer."""
     overfit_batches: Annotated[int | float, at_least(0)] = 0.0
     """Share (0.5) or number (5) of the training batches that are trained on again and again, in one order, to see
-    whether the network can learn them by heart; as much is validated on. 0.0 trains as usual. More are harder to learn
+    whether the network can learn them by heart; validation uses as many. 0.0 trains as usual. More are harder to learn
     by heart."""
     val_check_interval: Annotated[int | float | str | dict[str, int] | None, above(0)] = 250
     """Number of batches from one validation to the next, max_steps at most; or a time, days:hours:minutes:seconds; or,
@@ -77,8 +77,8 @@ class TrainerSettings:
     """Number of epochs (passes over the training frames) from one that is validated to the next; null lets
     val_check_interval count batches, whatever the epoch. More validate less often."""
     num_sanity_val_steps: Annotated[int | None, at_least(-1)] = 0
-    """Number of validation batches that are tried before training, so that what is wrong with them shows at once; 0 for
-    none, -1 for all. More find mistakes more surely, and training begins later."""
+    """Number of validation batches that are tried before training, so that a fault in them shows at once; 0 for none,
+    -1 for all. More find mistakes more surely, and training begins later."""
     log_every_n_steps: Annotated[int | None, at_least(0)] = 10
     """Number of steps from one point of the logged training curves to the next. More make coarser curves and smaller
     files."""
@@ -90,7 +90,7 @@ class TrainerSettings:
     not."""
     accumulate_grad_batches: Annotated[int, at_least(1)] = 1
     """Number of batches whose mean gradient makes one step, as one larger batch would, in less memory. More make
-    steadier steps, and as many steps take longer."""
+    steadier steps, and the same number of steps takes longer."""
     gradient_clip_val: Annotated[int | float | None, at_least(0)] = 1.0
     """Norm above which the gradient of a step is scaled down to it (with gradient_clip_algorithm value: size above
     which each of its values is cut); null and 0 never do. A larger one lets larger steps through."""
@@ -107,20 +107,21 @@ class TrainerSettings:
     """true: validation runs in PyTorch's inference mode, a little faster. false: it only leaves gradients out, for code
     that the mode does not suit. The results are the same."""
     use_distributed_sampler: bool = True
-    """Of several devices, true gives each its own part of the frames: together they see in a step what one would see
-    with a batch as large as all theirs. false gives all of them to each. With one device it changes nothing."""
+    """With several devices, true gives each its own part of the frames: in a step they see together what one device
+    would see with a batch as large as all of theirs. false gives all frames to each device. With one device it changes
+    nothing."""
     profiler: Literal["simple", "advanced", "pytorch"] | None = None
-    """What measures where the time of a run goes: simple, advanced or pytorch, each in more detail and slower. Left
-    out, nothing does."""
+    """Profiler that measures where a run spends its time: simple, advanced or pytorch, each in more detail and slower
+    than the one before. Left out, nothing is measured."""
     detect_anomaly: bool = False
     """true: where a gradient is not a number, PyTorch names the operation that it came from; much slower. false: it
     does not look."""
     sync_batchnorm: bool | None = None
-    """Of several devices, true takes the mean and deviation of batch normalisation over the frames of all of them, and
-    false over those of each; left out, GPUs do the one and processors, which cannot do else, the other. With one device
-    it changes nothing."""
+    """With several devices, true takes the mean and deviation of batch normalisation over the frames of all devices,
+    and false over those of each. Left out, it is true on GPUs and false on processors, which can do nothing else. With
+    one device it changes nothing."""
     reload_dataloaders_every_n_epochs: Annotated[int, at_least(0)] = 0
-    """Number of epochs (passes over the training frames) after which what reads the frames is started anew; 0 for
+    """Number of epochs (passes over the training frames) after which the reading of frames is started anew; 0 for
     never. The frames stay the same. More do it less often."""
 
 

@@ -38,9 +38,9 @@ class FitConfig:
     """Decay of the running average of the weights, in [0, 1), which is validated and exported in place of the last
     weights; 0 takes no average. A larger one averages over more steps, about 1 / (1 - decay) of them."""
     monitor: Literal["loss", "photometric", "inconsistency", "last"] = "loss"
-    """What must be least, on the validation frames, in the checkpoint that is exported; it needs no truth: the whole
-    "loss"; its "photometric" term (rendered against seen light); or the "inconsistency" (how much distance changes when
-    the image is mirrored and darkened). "last" exports the last step, whatever these say."""
+    """Value on the validation frames that chooses the exported checkpoint, the one where it is least; none needs truth:
+    the whole "loss"; its "photometric" term (rendered against seen light); or the "inconsistency" (how much distance
+    changes when the image is mirrored and darkened). "last" exports the last step, whatever these say."""
     patience: Annotated[int, at_least(0)] = 0
     """Number of validations in a row without a better value of --fit.monitor after which the run ends; 0 goes on to the
     last step. More wait longer."""

@@ -43,7 +43,7 @@ class Gone(Lost):
 @dataclass(frozen=True)
 @checked
 class SlurmConfig:
-    """What each job of the array is given by Slurm."""
+    """What Slurm gives to each job of the array."""
 
     partition: str | None = None
     """Partition of the cluster that the jobs go to; left out, the cluster's own default."""

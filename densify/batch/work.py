@@ -38,7 +38,7 @@ _MOST_UNREAD = 10
 @dataclass(frozen=True)
 @checked
 class Running:
-    """Who makes what, and where."""
+    """Which sequences are made, by how many processes, and where."""
 
     shard: str | None = None
     """Share of the sequences to make, I/N: 2/8 makes the second eighth. Shares cost about the same (frames times

@@ -115,8 +115,8 @@ class ModelSources:
     """Which depth models are compared, and what they run on."""
 
     checkpoints: tuple[str, ...] = ("decline", DEFAULT_CHECKPOINT)
-    """Depth models to compare, each a row: path of a checkpoint, bundled name, decline (a formula from how light fades,
-    no network) or constant (all equally far)."""
+    """Depth models to compare, each a row: path of a checkpoint, bundled name, decline (a formula for how light fades
+    with distance, no network) or constant (everything equally far)."""
     device: Device = "auto"
     """What networks run on: auto, a CUDA GPU where there is one, else the processor; cpu, the processor; cuda; or mps,
     the GPU of an Apple computer."""

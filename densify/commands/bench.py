@@ -114,7 +114,7 @@ def run(
         recipes: Ways to make surfaces that are compared: full (all steps), paper (as published: one scale per keyframe,
             plain TSDF, and the gates and the reach that densify --recipe paper names), or both. Options of agreement,
             bending, contradiction and rectify count for full alone.
-        cases: Errors that map points share, each tried with one scale a keyframe and in full, by the last of
+        cases: Errors that map points share, each tried with one scale per keyframe and with all steps, by the last of
             --checkpoints: clean (none), side (30 % of the points, on one side, 15 % too far), wide side (45 %, 30 %),
             drift (of scale, 30 %), fold (20 % one fold too far), loop (half closed where there is none), poses (a bent
             path), breath 2, 5 and 10 (the wall breathes by as many %), waves (peristalsis of 10 %). Left out, clean,
@@ -260,8 +260,8 @@ def compare_per_frame(
     """Depth of single frames beside the closed form, on twelve colons of a renderer that nothing was trained on.
 
     Args:
-        output: Folder to make, with per-frame.json, .md and report.html, and unless --colons is given the colons'
-            frames and their truth in colons/, each a sequence that predict and evaluate read, and a picture of them.
+        output: Folder to make, with per-frame.json, .md and report.html, and, unless --colons is given, the colons'
+            frames and their truth in colons/ (each a sequence that predict and evaluate read) with a picture of them.
         colons: Folder colons/ of an earlier run, whose frames are taken in place of making them anew, which takes some
             ten minutes.
         spoilt: Judge frames with blur, smoke, water drops, clipping, noise and compression too, at five severities:

@@ -45,9 +45,9 @@ def measure_speed(
         output: Folder to make, with speed.json, .md and report.html. Where it is runs/speed, dry runs in the same
             folder take their times from it; LIGHTDEPTH_SPEED names another speed.json.
         image_sizes: Widths and heights of the frames, pixels, each measured on its own; a whole run is made at twice
-            the last one's, too. Larger ones and more take longer; costs of other sizes are computed from these.
-        keyframes: Number of keyframes of the map that is made for each size; the first has another one, with twice as
-            many. More tell better what a keyframe costs and take longer.
+            the last one as well. Larger ones and more take longer; costs of other sizes are computed from these.
+        keyframes: Number of keyframes of the map that is made for each size; the first size has a second map, with
+            twice as many. More tell better what a keyframe costs and take longer.
         seconds: Time for which a stage and its reference are timed in turns, seconds, for each size; slow ones are
             timed three times whatever that takes. More make the medians more certain.
         overwrite: Replace a run made before.

@@ -48,13 +48,13 @@ def demo(
         output: Run folder to make, with the data, the surfaces and the report.
         frames: Number of frames to render, 0.7 mm apart. More make a longer path and take longer.
         seed: Number that draws the colon, its light, the path and the map's errors; bundled checkpoints were trained on
-            none below 1000. Another one draws another colon.
+            no number below 1000. Another one draws another colon.
         size: Width and height of the images, pixels. A larger one shows finer detail and takes longer.
         lens: Lens of the endoscope: pinhole (90 degrees across), telescope (70), fisheye (136) or c3vd (that of the
             data set C3VD).
         spurious: Share of the map points, in [0, 1), that are wrong. A larger one makes the map harder to densify.
         wrong_side: Factor, from 0.1 to 10, by which points on one side of the first submap are too far away, so that
-            there is a bad surface to see too; 1 leaves them right. A larger one makes it worse.
+            the demo also shows a bad surface; 1 leaves them right. A larger one makes it worse.
         overwrite: Replace a run made before.
     """
     arguments = recorded(

@@ -48,11 +48,11 @@ def export(
         output: Folder to make, with a folder for each map, a file for each frame, or the model.
         to: What to write (required): colmap, nerfstudio, ply, glb, obj, tum or climb of maps; png (16 bits)
             or exr of depth; onnx, torch (torch.export) or safetensors of a network.
-        size: Width and height, pixels, of the only images that an onnx or torch graph takes; left out, it takes
-            any. A larger one makes the network slower.
+        size: Fixed width and height, pixels, of the images that an onnx or torch graph takes; left out, it takes any. A
+            larger one makes the network slower.
         half: Store the weights of safetensors in half precision, as checkpoints are kept; false keeps all digits.
-        step: Depth of one code of a 16-bit png, in mm or the unit that the predictions have; left out, a power of ten
-            that the farthest fits. A larger one holds farther depth, less finely.
+        step: Depth that one step of a 16-bit png's code stands for, in mm or the unit of the predictions; left out, a
+            power of ten with which the farthest pixel fits. A larger one holds farther depth, less finely.
         overwrite: Replace a folder made before.
     """
     arguments = recorded(maps, what=what, output=output, to=to, size=size, half=half, step=step)

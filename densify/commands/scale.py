@@ -32,8 +32,8 @@ def scale(
             one that the run was given, else that of its frames.
         data: Frames of the run; left out, those that the run names, where they still are.
         length: a length that is known
-        wall_mm: Distance of the wall, mm, in the median; scales are looked for that make it .4 to 2.5 times this. A
-            larger one looks for larger scales.
+        wall_mm: Median distance of the wall, mm, to start from: scales are tried that make the distance 0.4 to 2.5
+            times this. A larger one looks for larger scales.
         output: Folder for scale.json; left out, scale/ in the run, where `measure` finds it.
         overwrite: Replace a folder made before (scale/ in a run is replaced without asking). Figures are replaced by
             figures alone: where no map has one, those of before stay.

@@ -35,7 +35,7 @@ class Beginning:
     are found as well."""
     repair: Path | None = None
     """Sparse map of the frames to make anew, by matching the images of its keyframes, beginning at its poses and
-    keeping its frame and scale; not with --poses. Left out, the map is made of all frames."""
+    keeping its coordinates and scale; not with --poses. Left out, the map is made of all frames."""
 
     def __post_init__(self) -> None:
         if self.repair is not None and self.poses is not None:
@@ -68,8 +68,8 @@ def sparse(
             which is assumed where the frames do not connect or their motion hardly tells it. A larger one means a
             shorter focal length.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
-        bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
-            their highest values show. A larger one reads the same numbers as darker.
+        bit_depth: Bits per sample of pictures that have more than 8; left out, it is read from the files, else told by
+            their highest values. A larger one reads the same numbers as darker.
         sfm: how frames are mapped
         overwrite: Replace a folder made before.
         resume: Go on with the run that was stopped there, as it was begun; features and matches that are done, up to

@@ -36,10 +36,10 @@ def view(
             are.
         mm_per_unit: Millimetres that a unit of the surface stands for, where the run did not know it; lengths are then
             in mm. A larger one makes them longer in proportion. It is refused where the surface is in mm already.
-        triangles: Number of triangles that are drawn of each surface at most; lengths are measured on all that there
-            are. More show finer detail and take a browser longer.
-        rerun: File, ending in .rrd, to write as a recording for the Rerun viewer (extra `rerun`), with the images, in
-            the place of a page to open. Left out, none is written.
+        triangles: Largest number of triangles drawn of each surface; lengths are measured on all that there are. More
+            show finer detail and take a browser longer.
+        rerun: File, ending in .rrd, to write as a recording for the Rerun viewer (extra `rerun`), with the images,
+            instead of opening a page. Left out, none is written.
     """
     if rerun is not None:
         _record(run, data, mm_per_unit, triangles, rerun)

@@ -50,8 +50,9 @@ class DepthReading:
     ray, depth along the axis, or disparity, which is one over depth. Left out, the folder is one of `lightdepth
     predict`."""
     depth_scale: Annotated[float | None, above(0)] = None
-    """Factor from the numbers in another program's depth files to mm (of disparity: depth is the factor over it). Left
-    out, they are up to scale, or as `lightdepth export` says in its run.json. A larger one makes a farther wall."""
+    """Factor from the numbers in another program's depth files to mm (for disparity, depth is this factor divided by
+    it). Left out, they are up to scale, or as `lightdepth export` says in its run.json. A larger one makes a farther
+    wall."""
 
     def __post_init__(self) -> None:
         if self.depth_scale is not None and not (np.isfinite(self.depth_scale) and self.depth_scale > 0):

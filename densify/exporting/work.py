@@ -34,8 +34,8 @@ class MapExport:
     map: Path | None = None
     """Sparse map that the run was made of, for tracks; left out, the one that the run names, where it still is."""
     points: Annotated[int, at_least(0)] = 100_000
-    """Number of the surface's vertices at most that stand among the points of colmap, nerfstudio and climb, besides
-    the map's own. More show the surface more finely and make larger files."""
+    """Largest number of the surface's vertices that are written as points of colmap, nerfstudio and climb, besides the
+    map's own points. More show the surface more finely and make larger files."""
     frame_offset: Annotated[int, ANY] = 1
     """Number added to each frame's number where climb is written, which counts frames from 1 and we from 0. A larger
     one gives later numbers."""

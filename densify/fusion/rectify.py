@@ -44,13 +44,13 @@ class RectifyConfig:
     """Largest change of log distance per radian of view with which a pixel is fused: 10 leaves out edges, and wall seen
     at less than 5.7 degrees to its surface. A larger one keeps more of the wall, less accurately."""
     dark: Annotated[float, SHARE] = 0.02
-    """Brightness of a pixel's brightest channel, in [0, 1], below which its weight falls from 1, to unlit at black. A
-    higher one trusts dark pixels less."""
+    """Brightness of a pixel's brightest channel, in [0, 1], below which its weight falls, from 1 down to the value of
+    unlit at black. A higher one trusts dark pixels less."""
     bright: Annotated[float, SHARE] = 0.98
-    """Brightness of a pixel's brightest channel, in [0, 1], above which its weight falls from 1, to unlit at full
-    brightness, because it may be clipped. A higher one trusts bright pixels more."""
+    """Brightness of a pixel's brightest channel, in [0, 1], above which its weight falls, from 1 down to the value of
+    unlit at full brightness, because it may be clipped. A higher one trusts bright pixels more."""
     unlit: Annotated[float, SHARE] = 0.5
-    """Weight, from 0 to 1, of a black or clipped pixel, a well-lit one having 1. A larger one trusts such pixels more;
+    """Weight, from 0 to 1, of a black or clipped pixel; a well-lit one has 1. A larger one trusts such pixels more;
     below 0.5 surfaces came out a little worse."""
     sigma: Annotated[float, above(0)] = 0.15
     """Uncertainty that the model states for a pixel, as standard deviation of log distance (0.15 is 15 %), at which the

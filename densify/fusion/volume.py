@@ -38,7 +38,7 @@ class FusionConfig:
 
     voxel: Annotated[float | None, above(0)] = None
     """Edge of a voxel, the smallest cell of the volume that the surface is made in, map units; left out,
-    voxels_per_distance sets it. A larger one makes a coarser surface, sooner."""
+    voxels_per_distance sets it. A larger one makes a coarser surface in less time."""
     voxels_per_distance: Annotated[float, above(0, up_to=1000)] = 52.0
     """Number of voxels in the typical distance from a submap's keyframes to their points, which sets the voxels' size
     where voxel is left out. More make a finer surface and take more time and memory."""
@@ -49,17 +49,17 @@ class FusionConfig:
     """Least number of keyframes that must have seen a piece of surface for it to be kept; the recipe paper keeps all.
     More leave out what few have seen."""
     front: Annotated[float, SHARE] = 0.3
-    """Weight, from 0 to 1, that a keyframe keeps where the wall is, by its depth, farther on by the truncation or more;
-    it falls steadily from the wall to there. A larger one cuts away more of what keyframes look through, with steps
-    where they disagree; 1 cuts with full weight."""
+    """Weight, from 0 to 1, of a keyframe in the space that it looks through, at the truncation's distance in front of
+    its wall or more; from the wall to there it falls steadily. A larger one cuts away more of what keyframes look
+    through, with steps where they disagree; 1 cuts with full weight."""
     far: Annotated[float, above(0)] = 2.0
     """Farthest distance from a keyframe that is fused, as a multiple of the distance within which 90 % of its inliers
     lie. A larger one reaches farther, where depth is worse."""
 
     max_error: Annotated[float, above(0)] = 12.0
-    """Largest error, a ratio to the distance in per cent, that is expected of a pixel that is fused: by its
-    uncertainty, its slant, how far it lies beyond the map's points, and its light. A larger one keeps more of the wall,
-    less accurately; the recipe paper keeps all."""
+    """Largest expected error, as a ratio to distance in per cent, with which a pixel is still fused. It is estimated
+    from the pixel's uncertainty, its slant, how far it lies beyond the map's points, and its light. A larger one keeps
+    more of the wall, less accurately; the recipe paper keeps all."""
 
     def voxel_for(self, submap: Submap) -> float:
         """The size of a voxel, in map units."""

@@ -17,7 +17,7 @@ WAYS: tuple[Way, ...] = get_args(Way)
 @dataclass(frozen=True)
 @checked
 class MergeConfig:
-    """When two submaps are one. Lengths on the surface are shares of the reach."""
+    """When two submaps are joined. Lengths on the surface are shares of the typical distance from camera to wall."""
 
     by: tuple[Way, ...] = ("points", "frames", "looks")
     """What submaps may be joined by, tried in the order given: points (map points of both), frames (surfaces seen in

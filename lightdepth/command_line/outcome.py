@@ -33,7 +33,7 @@ from lightdepth.foreign_text import for_line, for_terminal
 QUIET, JSON = "--quiet", "--json"
 SAID_OF = {
     "quiet": "Say nothing but errors, warnings, and what was written where; log.txt has all of it.",
-    "json": "Print what came of it as one JSON document, and nothing else, on standard output.",
+    "json": "Print the result as one JSON document on standard output, and nothing else there.",
 }
 """The words that every verb takes, with their sentences for the help."""
 _ANSWERED = ("-h", "--help", "--help_all", "--print_config", "-V", "--version")

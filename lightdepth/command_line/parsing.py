@@ -33,7 +33,7 @@ _OPTION = re.compile(r"(?<![\w/.-])--[A-Za-z][\w.-]*")
 _GENERAL = {
     "help": "Show the everyday options, with examples, and exit.",
     "config": "YAML file with any of these options; those on the command line win.",
-    "print_config": "Print all settings, those given before it among them, as YAML that --config reads, and exit. "
+    "print_config": "Print all settings, with those given before this option, as YAML that --config reads, and exit. "
     "`=skip_null` leaves out those that are not set.",
 }
 _LAST = ("overwrite", "resume", "dry_run", "quiet", "json", "config", "print_config", "help")

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from lightdepth.command_line.parsing import Parser
 
 GROUP = "lightdepth.commands"
-KEEP_NAMES = """Write the paths of inputs as they are into run.json, log and reports. Without it they are called by the
-option and a hash of their contents, as paths are often names of patients, and inputs.json alone has the paths."""
+KEEP_NAMES = """Write the paths of inputs as they are into run.json, log and reports. Without it, each input is named
+there by its option and a hash of its contents, because paths often hold names of patients; only inputs.json has the
+paths."""
 ORDER = (
     "demo",
     "doctor",

@@ -57,8 +57,8 @@ def calibrate_light(
             looking if left out.
         camera: Calibration file, which wins over all others; left out, the map's own camera, else the folder's.
         mask: Image, white where tissue shows and black elsewhere; left out, the folder's own mask, where it has one.
-        bit_depth: Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what
-            their highest values show. A larger one reads the same numbers as darker.
+        bit_depth: Bits per sample of pictures that have more than 8; left out, it is read from the files, else told by
+            their highest values. A larger one reads the same numbers as darker.
         seed: Number that draws the bootstrap samples, which tell how sure the light is. Another one gives slightly
             different intervals.
         overwrite: Replace files that an earlier run made.

@@ -32,11 +32,12 @@ def convert_camera(
         file: Calibration of any kind that is read: camera.json, vicalib XML, OpenCV's YAML or XML, Kalibr, ORB-SLAM,
             nerfstudio, MATLAB, COLMAP, ocamcalib or intrinsics.txt.
         output: File to write the camera to, in a format that its name tells.
-        model: Lens model to have instead, fitted by least squares: PINHOLE (no distortion), OPENCV (k1, k2, p1, p2),
+        model: Lens model to convert to, fitted by least squares: PINHOLE (no distortion), OPENCV (k1, k2, p1, p2),
             FULL_OPENCV (with k3 to k6), these three up to 75 degrees from the axis, OPENCV_FISHEYE or SCARAMUZZA; left
-            out, the file's own stays.
-        size: Width and height, pixels, of the images that the camera is to be for, in the same proportion as its own
-            (intrinsics.txt holds none and needs it); left out, its own. A larger one makes a camera of larger images.
+            out, the file's own is kept.
+        size: Width and height, pixels, of the images that the camera is for, in the same proportion as in the file;
+            left out, the file's (intrinsics.txt holds none and needs this option). A larger one makes a camera for
+            larger images.
         to: Format of the output: json, vicalib (XML), opencv (YAML), colmap, ocamcalib, or intrinsics.txt as 3 x 3 or 4
             x 4 matrix; left out, the one that the output's name tells.
         mask: Image, white where tissue shows: with --model, only these pixels count in the fit; left out, all do.

@@ -50,13 +50,14 @@ def import_frames(
 
     Args:
         output: Folder to make, with the sequence and the report; with --no-frames, the report and its tables alone.
-        overlay_mask: Image of the frames' size, white where text is to be blacked out, besides what --find-text finds.
+        overlay_mask: Image of the frames' size, white where text is to be blacked out, in addition to what --find-text
+            finds.
         find_text: Look for text burnt into the frames, and black it out; switched off, only what --overlay-mask marks
             is.
-        frames: Write the frames; switched off, only the report is written, with no image of the patient, fit for
-            mailing.
-        keep_names: Let run.json and the report hold the names of files; switched off, they are left out, as they may
-            tell the patient.
+        frames: Write the frames; switched off, only the report is written, with no image of the patient, so that it can
+            be mailed.
+        keep_names: Let run.json and the report hold the names of files; switched off, they are left out, because they
+            may name the patient.
         overwrite: Replace a folder made before.
         resume: Go on with the run that was stopped there, as it was begun; frames that are done are not measured or
             written again.

@@ -50,11 +50,11 @@ def predict(
 
     Args:
         output: Folder to make, with one .npz for each frame: distance (up to scale), albedo and normals.
-        refine: Number of steps in which the predicted distance of each image is changed so that its wall, lit from that
-            far, looks more like the image; 0 for none, 100 is usual. More fit the image closer, which is not always
+        refine: Number of steps that change the predicted distance of each image so that a wall at that distance, lit,
+            looks more like the image; 0 for none, 100 is usual. More fit the image more closely, which is not always
             nearer to the truth, and take longer.
         uncertainty: Run folder of `densify` on the same endoscope with the same checkpoint, or its uncertainty.json;
-            the predicted uncertainty is multiplied by the factor that hidden blocks of that map say. A larger factor
+            the predicted uncertainty is multiplied by the factor that hidden blocks of that map gave. A larger factor
             makes wider intervals. Left out, uncertainty is written as predicted.
         previews: true: a PNG with the image and its distance is written for every frame as well, into previews/. false:
             none is.

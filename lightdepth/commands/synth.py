@@ -49,11 +49,11 @@ class ColonConfig:
     """Length of the path along the colon, mm. A longer one, with as many frames, makes neighbouring frames less
     alike."""
     light: str | None = None
-    """Light to have instead of a drawn one: a light.json, or its terms, as in gamma=2.2,mu=0 (gamma: the camera's
-    response; mu: how narrow the beam is, 0 shining alike to all sides)."""
+    """Light to use instead of a drawn one: a light.json, or values such as gamma=2.2,mu=0 (gamma: the camera's
+    response; mu: how narrow the beam is; at 0 it is equally bright in all directions)."""
     family: Literal["plain", "realistic"] = "plain"
     """Kind of colon: plain (tube, folds, vessels; its ranges are under --scene) or realistic (also polyps, mucus,
-    bubbles, blur and what else real images have; it takes no --scene)."""
+    bubbles, blur and other things that real images show; it takes no --scene)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where frames are rendered: cpu, cuda (a GPU; needs the extra gpu), or auto, the GPU where there is one and that
     extra is installed."""

@@ -35,8 +35,8 @@ class SequenceSource:
     """Image, white where tissue shows and black elsewhere, used instead of the folder's own mask. Left out, the
     folder's own, where it has one, else the black border is found."""
     bit_depth: Annotated[int | None, Range(8, 32)] = None
-    """Bits of a sample in pictures that are stored in more than 8, e.g. 10 where white is 1023; left out, what the
-    files say, else what their highest values show. A larger one reads the same numbers as darker."""
+    """Bits per sample of pictures that have more than 8, e.g. 10 where white is 1023; left out, it is read from the
+    files, else told by their highest values. A larger one reads the same numbers as darker."""
     fov: Annotated[float | None, Range(10, 175)] = None
     """Field of view across the image's width, degrees, at which --camera auto (which it implies) starts, and which is
     assumed where the frames do not connect or their motion hardly tells it. A larger one means a shorter focal length.

@@ -17,11 +17,11 @@ from lightdepth.sparse_map import SparseMap
 
 @dataclass(frozen=True)
 class PairingConfig(MapReading):
-    """How frames and a map meet, and what is asked of them."""
+    """How frames are matched with a map's keyframes, and what is required of them."""
 
     trust_map: bool = False
-    """true: where the images say that the map was made of other frames than these, a warning is given and the run goes
-    on. false: the run stops with an error."""
+    """true: where the images say that the map was made from other frames than these, a warning is given and the run
+    goes on. false: the run stops with an error."""
 
 
 def check_pairing(

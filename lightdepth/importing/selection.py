@@ -34,11 +34,12 @@ class Choice:
     """Time after which frames are left out, seconds from the first frame; left out itself, all are kept to the last. A
     larger one keeps more."""
     blur: Annotated[float, BELOW_ONE] = 0.6
-    """Share, in [0, 1), of the sharpness that the best quarter of the frames within about a second before and after
-    reach, below which a frame is left out as blurred; 0 leaves out none as blurred. A larger one leaves out more."""
+    """Least sharpness of a frame, as a share, in [0, 1), of that which the sharpest quarter of the frames within about
+    a second before and after reach. A frame below it is left out as blurred; 0 leaves out none. A larger one leaves out
+    more."""
     max_frames: Annotated[int | None, at_least(1)] = None
-    """Largest number of frames to keep; where the other options keep more, this number of those is taken, evenly. A
-    larger one keeps more frames; without it there is no limit."""
+    """Largest number of frames to keep; where the other options keep more, this number of them is taken at even steps.
+    A larger one keeps more frames; without it there is no limit."""
 
     def __post_init__(self) -> None:
         if self.end is not None and self.end <= self.start:

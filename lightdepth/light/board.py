@@ -39,8 +39,8 @@ class BoardConfig:
     marker_mm: Annotated[float | None, above(0, up_to=1000)] = None
     """Side of a marker of a charuco board, mm, its black border included. A larger one leaves less white around it."""
     dictionary: Dictionary = "4x4"
-    """Dots of a charuco board's markers, across and down; of OpenCV's dictionaries, or ArUco's original one. How many
-    markers the dictionary has, as in 4x4_250, does not matter: the first ones are the same."""
+    """Number of dots across and down in a charuco board's markers, from OpenCV's dictionaries or ArUco's original one.
+    How many markers the dictionary has, as in 4x4_250, does not matter: the first ones are the same."""
 
 
 @dataclass(frozen=True)

@@ -37,11 +37,11 @@ CONFIDENCE = 0.9
 @dataclass(frozen=True)
 @checked
 class LampsConfig:
-    """What is sought."""
+    """Which lamps are sought."""
 
     number: Annotated[int | None, Range(1, 3)] = None
-    """Number of lamps beside the lens. More explain brightness better, right or wrong; left out, as many as make frames
-    that were kept from the fit brighter or darker as they are."""
+    """Number of lamps beside the lens. More explain brightness better, even where they do not exist; left out, one more
+    is taken as long as it predicts the brightness of frames kept out of the fit better by a tenth."""
     gamma: Annotated[float | None, Range(*GAMMA_RANGE)] = None
     """Response exponent of the camera, where it is known, as in 2.2. A larger one takes the same code values for less
     light; left out, it is fitted."""
@@ -51,12 +51,12 @@ class LampsConfig:
 
 @dataclass(frozen=True)
 class PositionConfig:
-    """Whether the lamps' place is sought, on what, and how."""
+    """Whether the position of the lamps is sought, on which board, and how."""
 
     position: Kind | None = None
-    """What printed board the frames show, charuco or checkerboard: from its white paper the position of the light is
-    found, in millimetres, with response and spread. --board.squares and --board.square-mm say its size. Left out, no
-    position is sought."""
+    """Printed board that the frames show, charuco or checkerboard. Its white paper tells the position of the light, in
+    millimetres, the light's spread and the camera's response. --board.squares and --board.square-mm say its size. Left
+    out, no position is sought."""
     board: BoardConfig = field(default_factory=BoardConfig)
     """The printed board."""
     lamps: LampsConfig = field(default_factory=LampsConfig)
@@ -112,7 +112,7 @@ class BoardFit:
         many = "" if len(lamps.shares) == 1 else f" (the middle of {len(lamps.shares)} lamps)"
         return (
             f"at {place} mm{many}, nine of ten times; gamma {lamps.gamma:.2f}, mu {self.light.mu:.2f}, of which the "
-            f"lens {lens}; {len(self.whites)} of {self.looked_at} frames, of whose white {self.left:.1%} is left over"
+            f"lens {lens}; {len(self.whites)} of {self.looked_at} frames, {self.left:.1%} of their white is unexplained"
         )
 
 

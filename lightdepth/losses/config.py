@@ -30,8 +30,8 @@ class LossConfig:
     distance is learnt; "one" takes 1, so that brightness must give the scale of distance too, for which
     --model.network.output has to be free."""
     ssim: Annotated[float, at_least(0)] = 0.0
-    """Weight of what rendered and seen RGB lack in structural similarity (SSIM), compared in windows of 5 x 5 pixels; 0
-    leaves it out. A larger one follows the edges and the texture of the image more closely."""
+    """Weight of how much rendered and seen RGB differ in structure (structural similarity, SSIM), compared in windows
+    of 5 x 5 pixels; 0 leaves it out. A larger one follows the edges and the texture of the image more closely."""
     saturated: Annotated[float, at_least(0)] = 0.3
     """Weight of the term on saturated pixels (see `white`), which counts only what is rendered darker than seen, as if
     the rendered image were clipped at white too; 0 leaves it out. A larger one pulls wall that is too bright to measure
@@ -60,17 +60,17 @@ class LossConfig:
     larger one makes the albedo more even."""
     self_supervised: Annotated[float, at_least(0)] = 1.0
     """Factor on the weights from photometric to albedo, whose terms need no truth; 0 leaves them out. A larger one
-    counts them for more against `supervised`, and without that changes next to nothing."""
+    gives them more weight against `supervised`; without that it changes next to nothing."""
     supervised: Annotated[float, at_least(0)] = 0.0
     """Weight of the term that compares with true distance, up to one factor per image; at 0, truth is not read for it.
-    A larger one counts truth for more against the terms that need none."""
+    A larger one gives truth more weight against the terms that need none."""
     uncertainty: Annotated[float, at_least(0)] = 0.0
     """Weight of the term that teaches the uncertainty head how large the error against true distance is; 0 leaves it
     out, and nothing but that head learns from it. A larger one changes little, as AdamW evens out the size of
     gradients."""
     reflectance: Annotated[float | None, BELOW_ONE] = 0.6
-    """Share of light, in [0, 1), that the wall throws back onto other wall, when images are rendered; null takes the
-    value calibrated for each image, 0 renders direct light alone. A larger one renders more indirect light."""
+    """Share of light, in [0, 1), that the wall reflects onto other wall, when images are rendered; null takes the value
+    calibrated for each image, 0 renders direct light alone. A larger one renders more indirect light."""
     cosine_exponent: Annotated[float, at_least(0, up_to=100)] = 0.5
     """Exponent of the cosine of the angle at which light meets the wall, in rendered light: 1 is a matt (Lambert's)
     wall; at 0 the angle counts for nothing. A larger one renders slanted wall darker."""
@@ -86,16 +86,16 @@ class LossConfig:
     """Brightness of a pixel, from .2 to 1, above which the camera is taken to compress bright light; this is undone
     before images are compared. A higher one undoes less, and 1 nothing."""
     huber: Annotated[float, at_least(0)] = 0.05
-    """Difference between rendered and seen light at which the photometric and saturated terms turn from growing with
-    its square to growing in proportion to it; 0 is proportion throughout (L1). Its unit is that of `space`: natural log
-    of brightness, or values in [0, 1]. A larger one makes small differences count less against large ones."""
+    """Difference between rendered and seen light below which the photometric and saturated terms grow with its square,
+    and above which they grow in proportion to it; 0 is proportion throughout (L1). Its unit is that of `space`: natural
+    log of brightness, or values in [0, 1]. A larger one makes small differences count less against large ones."""
     white: Annotated[float, SHARE] = 0.97
     """Brightness (the largest of R, G and B), in [0, 1], from which a pixel counts as saturated and is left to the
     terms `saturated` and, in highlights, `specular`. A higher one leaves fewer pixels to them, and more to the
     photometric term."""
     bounces: Annotated[int, at_least(0, up_to=1000)] = 3
-    """Number of times that light thrown back by the wall is passed on once more to other wall, in rendered light; it
-    matters only where `reflectance` is above 0. More are more exact and take longer."""
+    """Number of times that reflected light is passed on to other wall, in rendered light; it matters only where
+    `reflectance` is above 0. More are more exact and take longer."""
     pool: Annotated[int, at_least(1, up_to=10_000)] = 8
     """Side of the squares of the image that light each other in the indirect light, pixels, in images of up to 128
     rows; in larger ones it grows with their height. A larger one is coarser and faster."""

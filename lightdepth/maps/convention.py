@@ -118,8 +118,8 @@ class MapReading:
     the frames' stamps, unless both are on one clock such as Unix time. A higher one gives each time a later frame; maps
     that name frames by number do not need it."""
     time_offset: Annotated[float | None, Range(-1e12, 1e12)] = None
-    """What the map's clock shows at the time 0 of the frames, seconds; left out, it is found where the clock is
-    another one, such as Unix time, and said. A larger one makes earlier frames of the keyframes."""
+    """What the map's clock shows at the time 0 of the frames, seconds; left out, it is found, and reported, where the
+    map has another clock, such as Unix time. A larger one matches each keyframe with an earlier frame."""
     time_tolerance: Annotated[float | None, above(0)] = None
     """How far a keyframe's time may be from the stamp of its frame, seconds; left out, half a frame. A larger one
     accepts poorer stamps."""

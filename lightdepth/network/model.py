@@ -50,7 +50,8 @@ class NetworkConfig:
     inputs: tuple[Input, ...] = ("rgb", "closed_form", "ray_z")
     """What the network sees at each pixel, a list: rgb (the image), closed_form (log distance, computed from brightness
     alone), ray_z (cosine of the angle from the optical axis), mask (whether tissue shows), reflectance (the share of
-    light that the wall throws back, as the calibration has it). What is left out, it has to do without."""
+    light that the wall reflects onto other wall, as the calibration has it). The network does without what is left
+    out."""
     output: Literal["residual", "limited", "absolute", "free"] = "residual"
     """What the network answers at each pixel: "residual", what is to be added to the log distance of the closed form
     (which brightness alone gives); "limited", the same, but with the closed form held within a factor of e of its
@@ -59,7 +60,7 @@ class NetworkConfig:
     encoder: Encoder | None = None
     """Encoder, the part of the network that reads the image: for unet efficientnet-lite0 (5 million weights), resnet18
     (14), resnet34 (24) or resnet50 (33); for dpt vitt14 (6 million), vits14 (25), vitb14 (97) or vitl14 (335). Those
-    with more weights are stronger and slower. null takes resnet18 or vits14; tiny has no choice."""
+    with more weights are stronger and slower. null takes resnet18 or vits14; for tiny it has no effect."""
     uncertainty: bool = False
     """true: the network also says how uncertain it is at each pixel, the standard deviation of log distance; it learns
     that where --model.loss.uncertainty is above 0. false: it gives distance and albedo (the wall's colour) only."""

@@ -43,8 +43,8 @@ class SfmConfig:
     highlight_margin_px: Annotated[int, at_least(0, up_to=10_000)] = 3
     """Distance that features keep from a highlight, pixels. A larger one leaves out more of the image."""
     contrast: Annotated[float, at_least(0, up_to=1000)] = 2.0
-    """Strength of evening out the contrast of dark and bright tissue before features are looked for, a factor (CLAHE's
-    clip limit); 0 leaves images as they are. A larger one brings out more, noise included."""
+    """How strongly the contrast of dark and bright tissue is evened out before features are looked for, a factor
+    (CLAHE's clip limit); 0 leaves images as they are. A larger one brings out more, noise included."""
     matching: Literal["auto", "sequential", "exhaustive"] = "auto"
     """Which frames are matched with each other: sequential, those that follow each other or look alike; exhaustive, all
     with all, which takes longer; auto, exhaustive for up to `exhaustive_up_to` frames, else sequential."""
@@ -52,20 +52,20 @@ class SfmConfig:
     """Number of frames up to which --sfm.matching auto matches all with all; longer sequences are matched sequentially.
     More find more connections, in time that grows with their square."""
     overlap: Annotated[int, at_least(1, up_to=100_000)] = 10
-    """Number of frames after each that it is matched with, in sequential matching. More bridge longer gaps and take
-    longer."""
+    """Number of following frames that each frame is matched with, in sequential matching. More bridge longer gaps and
+    take longer."""
     alike: Annotated[int, at_least(0, up_to=100_000)] = 5
-    """Number of frames farther off that each is also matched with, in sequential matching, those that look most like
-    it; 0 for none. More find more places that are seen again, and take longer."""
+    """Number of frames farther off that each frame is also matched with, in sequential matching: those that look most
+    like it; 0 for none. More find more places that are seen again, and take longer."""
     mapper: Literal["incremental", "global", "both"] = "both"
-    """What places the matched frames: incremental, one after the other; global, all at once (GLOMAP); both, global
-    for those that incremental left, as submaps of their own where many points hold them."""
+    """What places the matched frames: incremental, one after the other; global, all at once (GLOMAP); both, first
+    incremental, then global for the frames that it left out, as submaps of their own where many points support them."""
     min_model_size: Annotated[int, at_least(2)] = 3
     """Least number of frames of a submap (a part of the map that hangs together, with a scale of its own); smaller ones
     are left out. More leave out more."""
     min_points: Annotated[int, COUNT] = 8
-    """Least number of points of a submap (a part of the map that hangs together, with a scale of its own); poorer ones
-    are left out. More leave out more."""
+    """Least number of points of a submap (a part of the map that hangs together, with a scale of its own); those with
+    fewer are left out. More leave out more."""
     init_min_tri_angle: Annotated[float, at_least(0, up_to=180)] = 4.0
     """Least angle, degrees, between the lines of sight of the two frames that a map begins with; COLMAP asks for less
     where no pair has it. A larger one begins with a safer pair, where there is one."""
@@ -76,5 +76,4 @@ class SfmConfig:
     """Number of threads for features, matches and mapping. More make the map differ in the last digits from run to run,
     and were not faster on two cores."""
     seed: Annotated[int, SEED] = 0
-    """Number that the random samples of robust fits (RANSAC) follow from. Another one makes a slightly different
-    map."""
+    """Number that seeds the random samples of robust fits (RANSAC). Another one makes a slightly different map."""

@@ -23,7 +23,7 @@ class BreathingConfig:
     """How the wall of a colon moves."""
 
     amplitude: Annotated[float, Range(0, 0.3)] = 0.0
-    """Largest change of the colon's radius, as a share of it, up to 0.3; 0 keeps the wall still, and more needs
+    """Largest change of the colon's radius, as a share of it, up to 0.3; 0 keeps the wall still; any other value needs
     --slam.kind tracked. A larger one moves the wall more."""
     period: Annotated[float, above(0)] = 4.0
     """Time from one breath (or wave) to the next, seconds; without an amplitude it does nothing. A longer one moves the

@@ -34,15 +34,16 @@ class ExchangeConfig:
     """How light goes from wall to wall; of several forms one is drawn for each colon, of two ends a value between."""
 
     forms: tuple[Form, ...] = ("points",)
-    """Ways of reckoning the light between patches of wall, a list, of which each colon draws one: points, from the
-    patches' middles, as far as these see each other; through, the same, as if wall hid nothing, which is how the loss
-    reckons; enclosed, as points, but all of the light that a patch throws back falls on others, as in a closed hollow;
-    cast, by rays, the most exact."""
+    """Ways to compute the light between patches of wall, a list, of which each colon draws one: points, between the
+    patches' centres where these see each other; through, the same, but as if wall hid nothing, as the loss computes it;
+    enclosed, as points, but all the light that a patch reflects falls on others, as in a closed cavity; cast, by rays,
+    the most exact."""
     bounces: Annotated[tuple[int, int], ends_of(COUNT)] = (6, 6)
-    """Ends of the range of the number of times that light is thrown on from wall to wall. A larger one makes more
+    """Ends of the range of the number of times that light is reflected from wall to wall. A larger one makes more
     indirect light where the wall is bright, and takes longer."""
     coarser: Annotated[tuple[float, float], ends_of(above(0, up_to=10))] = (1.0, 1.0)
-    """Ends of the range of a factor on the length of the patches. A larger one makes coarser indirect light, sooner."""
+    """Ends of the range of a factor on the length of the patches. A larger one makes coarser indirect light in less
+    time."""
 
     def __post_init__(self) -> None:
         if not self.forms:

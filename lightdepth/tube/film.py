@@ -20,7 +20,7 @@ from lightdepth.tube.shape import smooth_noise
 @dataclass(frozen=True)
 @checked
 class FilmConfig:
-    """Ranges of what lies on the wall; all of it is off."""
+    """Ranges of what lies on the wall; by default nothing does."""
 
     mucus: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of the share of the wall under a film of mucus. A larger one covers more of it; (0, 0) makes

@@ -49,14 +49,14 @@ class MapErrors:
     """How far the patch of fold_share is moved ahead, as a share of the typical distance from a submap's keyframes to
     its points. A larger one moves it farther; below 0 it moves back."""
     loop_share: Annotated[float, SHARE] = 0.0
-    """Length, as a share of each submap's path in [0, 1], of a loop that is closed where there is none, between two
-    places along it that are taken for neighbours (see loop_shift); 0 closes none. A larger one makes a longer loop."""
+    """Length of a false loop, as a share, in [0, 1], of each submap's path: two places so far apart along it are taken
+    for neighbours (see loop_shift); 0 closes none. A larger one makes a longer loop."""
     loop_shift: Annotated[float, SHARE] = 0.5
     """How far the second of the two places of loop_share is moved towards the first, as a share in [0, 1] of the way
     between them; 1 makes them one. A larger one bends the map more."""
     loop_at: Annotated[float | None, SHARE] = None
-    """Where the first of the two places of loop_share is, as a share in [0, 1] of where it can be; left out, it is
-    drawn. A larger one closes the loop later on the path."""
+    """Where the first of the two places of loop_share is, as a share, in [0, 1], of the stretch of path where it can
+    be; left out, it is drawn. A larger one closes the loop later on the path."""
     pose_drift: Annotated[float, at_least(0)] = 0.0
     """How far the last keyframe is from its true place, as a share of the path's length; the error grows along the
     path, from 0 at the first. A larger one bends the path more."""

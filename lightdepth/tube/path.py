@@ -31,9 +31,9 @@ class PathConfig:
     """Standard deviation of how far the path strays from the colon's centreline, in each of two directions, as a share
     of the radius; it is cut off at 2.3 times that. A larger one brings the camera nearer to the wall."""
     turned: Annotated[tuple[float, float], ends_of(Range(0, math.pi))] = (0.0, 0.0)
-    """Ends of the range of the angle, radians, by which each view is turned from the way ahead, in a direction of its
-    own; (0, 0) looks ahead. A larger one looks at walls more from the front, and makes neighbouring frames less
-    alike."""
+    """Ends of the range of the angle, radians, by which each view is turned away from straight ahead, each in a
+    direction of its own; (0, 0) looks ahead. A larger one looks at walls more from the front, and makes neighbouring
+    frames less alike."""
 
 
 def lens(kind: str, width: int, height: int) -> CameraModel:

@@ -53,10 +53,10 @@ class TubeConfig:
     path: PathConfig = field(default_factory=PathConfig)
     """How the endoscope moves through the colon."""
     patch: Annotated[float, at_least(0.2, up_to=1000)] = 3.5
-    """Length along the tube, mm, of the patches of wall between which light is thrown to and fro. A larger one makes
-    coarser indirect light, sooner."""
+    """Length along the tube, mm, of the patches of wall that exchange light. A larger one makes coarser indirect light
+    in less time."""
     exchange: ExchangeConfig = field(default_factory=ExchangeConfig)
-    """How light between patches of wall is reckoned."""
+    """How light between patches of wall is computed."""
     least_cosine: Annotated[float, SHARE] = 0.0
     """Least cosine between the wall's normal, interpolated over its mesh, and the direction to the camera; normals
     turned farther away, at the edges of folds, are turned back to it. A larger one turns more of them; 0 leaves all as
@@ -308,7 +308,7 @@ class Tube:
         return irradiance(*parts, light, self.cosine_exponent)[:, 0, 0]
 
     def _make_patches(self) -> tuple[Patches, Tensor, Tensor]:
-        """The patches, their form factors, and the share of each colour (N, 3) that they throw back."""
+        """The patches, their form factors, and the share of each colour (N, 3) that they reflect."""
         mesh, size = self.shape.vertices.shape[:2], self._patch * self._exchange.coarser
         n_s, n_phi = max(8, round(mesh[0] * self.shape.step / size)), max(8, round(22 / self._exchange.coarser))
         # Each (s, phi) of the coarse grid once: the column at the seam is the first again.

@@ -38,13 +38,13 @@ class SensorConfig:
     """Root mean square of the distance by which the light sits beside the camera, mm, drawn for each endoscope. A
     larger one puts lamps farther from the camera."""
     reflectance: Annotated[tuple[float, float], ends_of(BELOW_ONE)] = (0.0, 0.7)
-    """Ends of the range of the share of the light falling on it that the wall throws back on other wall. A larger one
-    makes more indirect light."""
+    """Ends of the range of the wall's reflectance: the share of the light falling on it that it reflects onto other
+    wall. A larger one makes more indirect light."""
     specular: Annotated[tuple[float, float], ends_of(at_least(0))] = (0.0, 0.5)
     """Ends of the range of a factor on the strength of highlights (mirrored light of the lamp). A larger one makes
     brighter highlights; (0, 0) makes none."""
     bright_share: Annotated[tuple[float, float], ends_of(SHARE)] = (0.03, 0.2)
-    """Ends of the range of the share of an image's pixels that auto exposure lets reach full brightness. A larger one
+    """Ends of the range of the share of an image's pixels that reach full brightness under auto exposure. A larger one
     makes brighter images."""
     shoulder: Annotated[tuple[float, float], ends_of(SHARE)] = (0.75, 1.0)
     """Ends of the range of the code value (brightness as stored), in [0, 1], from which the tone curve flattens towards
@@ -56,8 +56,8 @@ class SensorConfig:
     """Ends of the range of the standard deviation of the log of the exposure from frame to frame (0.1 is about 10 %). A
     larger one makes brightness jump more."""
     cosine_exponent: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (1.0, 1.0)
-    """Ends of the range of the exponent on the cosine between the wall's normal and the direction to the lamp: 1 is
-    matt (Lambert), rough walls have less, satin ones more. A larger one makes slanted wall darker."""
+    """Ends of the range of the exponent on the cosine between the wall's normal and the direction to the lamp: 1 is a
+    matt wall (Lambert); rough walls have less, satin ones more. A larger one makes slanted wall darker."""
     gloss: Annotated[tuple[float, float], ends_of(at_least(0))] = (60.0, 60.0)
     """Ends of the range of the exponent of the lobe of highlights (as in Phong's model). A larger one makes smaller,
     sharper highlights."""
@@ -68,7 +68,7 @@ class SensorConfig:
     """Ends of the range of the slope, a ratio of height to length, of relief tenths of a millimetre wide. A larger one
     breaks highlights into more sparks; (0, 0) has no such relief."""
     vignetting: Annotated[tuple[float, float], ends_of(at_least(0, up_to=100))] = (0.0, 0.0)
-    """Ends of the range of the exponent k of the lens's darkening to the side, cos^k of the angle from its axis; (0, 0)
+    """Ends of the range of the exponent k of vignetting: the lens darkens by cos^k of the angle from its axis; (0, 0)
     is none. A larger one makes darker corners."""
     glare: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
     """Ends of the range of the share of the light that the lens spreads over the rest of the image. A larger one veils
@@ -80,8 +80,8 @@ class SensorConfig:
     """Ends of the range of the length of motion blur (median over an image's pixels, on average over images), as a
     share of the image height. A larger one blurs more; (0, 0) makes none."""
     defocus: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
-    """Ends of the range of the sigma (radius) of the blur out of focus, as a share of the image height. A larger one
-    blurs more; (0, 0) makes none."""
+    """Ends of the range of the sigma (radius) of the defocus blur, as a share of the image height. A larger one blurs
+    more; (0, 0) makes none."""
     cast: Annotated[tuple[float, float], ends_of(at_least(0, up_to=10))] = (0.0, 0.0)
     """Ends of the range of the standard deviation of the log of each colour channel's gain (0.06 is about 6 %). A
     larger one makes stronger colour casts; (0, 0) makes none."""

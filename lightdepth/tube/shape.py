@@ -42,11 +42,11 @@ class ShapeConfig:
     """Ends of the range of the deviation of the wall from a smooth tube between the folds, as a share of the radius. A
     larger one makes a less even wall."""
     step: Annotated[float, at_least(0.05, up_to=100)] = 0.8
-    """Distance between neighbouring points of the mesh that the wall is made of, mm. A larger one makes a coarser wall,
-    sooner."""
+    """Distance between neighbouring points of the mesh that the wall is made of, mm. A larger one makes a coarser wall
+    in less time."""
     crescent: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)
-    """Ends of the range of how unlike the three parts of a fold are, a share in [0, 1]: at 0 alike, at 1 each is
-    anything from missing to a third deeper. A larger one makes less regular folds."""
+    """Ends of the range of how much the three parts of a fold differ, a share in [0, 1]: at 0 they are alike, at 1 each
+    is anything from missing to a third deeper. A larger one makes less regular folds."""
     waviness: Annotated[tuple[float, float], ends_of(at_least(0, up_to=1000))] = (0.0, 0.0)
     """Ends of the range of how far a fold's line around the tube strays from a plane, mm. A larger one makes wavier
     folds."""
@@ -54,8 +54,8 @@ class ShapeConfig:
     """Ends of the range of how far three bands along the tube (taeniae) pull the wall inwards, as a share of the
     radius. A larger one makes a more triangular lumen."""
     polyps: Annotated[tuple[int, int], ends_of(at_least(0, up_to=10_000))] = (0, 0)
-    """Least and largest number of polyps in a colon, between which it is drawn. More polyps leave fewer images without
-    one."""
+    """Least and largest number of polyps in a colon; each colon draws a number between them. More polyps leave fewer
+    images without one."""
     polyp_radius: Annotated[tuple[float, float], ends_of(above(0, up_to=1000))] = (1.5, 5.0)
     """Ends of the range of the radius of a polyp's head, mm. A larger one makes larger polyps, but never so large that
     the endoscope cannot pass."""

@@ -32,7 +32,7 @@ Kind = Literal["tracked", "independent"]
 @dataclass(frozen=True)
 @checked
 class SlamConfig:
-    """How good the simulated SLAM is; what is left out depends on its kind."""
+    """How good the simulated SLAM is; the values of settings that are left out depend on its kind."""
 
     kind: Kind = "tracked"
     """Which SLAM is simulated: tracked errs as a real one does (short tracks, errors that neighbouring points share),
@@ -53,8 +53,8 @@ class SlamConfig:
     left out, 0.03 (tracked) or 0.3 (independent). A larger one makes the map harder to densify."""
     point_noise: Annotated[float | None, at_least(0, up_to=10)] = None
     """Error of the other points' distance, as a share of it: the median size (tracked; left out, 0.035), or the
-    standard deviation at 20 mm, in proportion more farther off (independent; left out, 0.01). A larger one makes a
-    noisier map."""
+    standard deviation at 20 mm, which grows in proportion to distance (independent; left out, 0.01). A larger one makes
+    a noisier map."""
     shared_noise: Annotated[float, SHARE] = 0.3
     """Share, in [0, 1], of the variance of point_noise that neighbouring points have in common; only with tracked. A
     larger one makes whole pieces of wall wrong together."""

@@ -32,7 +32,7 @@ class TextureConfig:
     vessels: Annotated[tuple[int, int], ends_of(at_least(0, up_to=10_000))] = (10, 45)
     """Least and largest number of stems of blood vessels, each of which branches. More give the wall more texture."""
     resolution: Annotated[float, at_least(0.02, up_to=100)] = 0.14
-    """Size of a texel, the pixel of the wall's paint, mm. A larger one makes coarser paint, sooner."""
+    """Size of a texel, the pixel of the wall's paint, mm. A larger one makes coarser paint in less time."""
     vessel_width: Annotated[tuple[float, float], ends_of(above(0, up_to=1000))] = (0.25, 0.7)
     """Ends of the range of the width of a vessel's stem, mm. A larger one makes thicker vessels."""
     vessel_value: Annotated[tuple[float, float], ends_of(SHARE)] = (0.0, 0.0)

@@ -18,7 +18,7 @@ POINTS = 100.0
 @dataclass(frozen=True)
 @checked
 class AdaptConfig:
-    """What of the network learns, from what, and for how long."""
+    """Which part of the network learns, from what, and for how long."""
 
     steps: Annotated[int, at_least(1)] = 300
     """Number of training steps. More move the network further from the checkpoint, for better or worse, and take
@@ -33,36 +33,36 @@ class AdaptConfig:
     """Width and height that images are resized to for training, pixels; left out, the height that the checkpoint was
     trained at, and the width that goes with it. A larger one shows finer detail and takes longer."""
     what: What = "all"
-    """Which weights learn: all (but those of the uncertainty head); decoder, all behind the part that reads the image;
-    norms, only scale and shift of the normalisations; low_rank, a small addition to each layer (see --rank). The fewer
-    learn, the less can change."""
+    """Which weights learn: all (except those of the uncertainty head); decoder, those after the encoder (the part that
+    reads the image); norms, only scale and shift of the normalisations; low_rank, a small addition to each layer (see
+    --rank). The fewer learn, the less can change."""
     rank: Annotated[int, at_least(1, up_to=10_000)] = 4
     """Number of ranks (independent directions) of what --what low_rank adds to each layer; without that it has no
     effect. More let the network change further."""
     anchor: Annotated[float | None, at_least(0)] = None
-    """Weight that holds the shape of each distance map to what the checkpoint gave before; 0 lets go. Left out, half of
-    --points where a map teaches and something judges; else 0 where true distance judges, and 20 where it does not. A
-    larger one holds it more firmly."""
+    """Weight of the term that keeps the shape of each distance map as the checkpoint gave it before; 0 leaves it out.
+    Left out, half of --points where a map teaches and something judges; else 0 where true distance judges, and 20 where
+    it does not. A larger one holds it more firmly."""
     replay: Annotated[int, at_least(0, up_to=1_000_000)] = 0
     """Number of synthetic colons of the kind that the checkpoint was trained on, whose frames fill half of each batch,
     so that what it knew is not lost; 0 for none. More show more variety and take longer to render."""
     points: Annotated[float | None, at_least(0)] = None
     """Weight of the map's points as teachers of distance (up to one factor per image); left out, 100 where there is a
-    map; 0, they teach nothing. Points that a held-out frame saw, and a fifth of the others in whole blocks of wall,
+    map; at 0 they teach nothing. Points that a held-out frame saw, and a fifth of the others in whole blocks of wall,
     only judge. A larger one follows the points more closely."""
     overlap: Annotated[float, at_least(0)] = 0.0
     """Weight of the term that makes the distances of two of the map's keyframes agree where both see the same wall; 0
     leaves it out. A larger one makes them agree better. Above 0 it needs a map, given or made."""
     judge: Literal["auto", "none"] = "auto"
     """What tells whether the adapted network is better: auto takes true distance where the frames have it, else the map
-    of --map, else one that is made of the frames. none does the same but makes no map, so that without truth and --map
-    nothing judges."""
+    of --map, else one that is made from the frames. none does the same but makes no map, so that without truth and
+    --map nothing judges."""
     held_out: Annotated[float, BETWEEN] = 0.2
     """Share of each sequence, above 0 and below 1, at its end, that judges and is never trained on. A larger one judges
     more surely and trains on less."""
     seed: Annotated[int, SEED] = 0
-    """Number that all chance follows from: order of frames, augmentation, replayed colons, blocks of wall that judge,
-    the beginning of low_rank. Another one makes another run, better or worse by chance alone."""
+    """Number that seeds all randomness: order of frames, augmentation, replayed colons, blocks of wall that judge,
+    first weights of low_rank. Another one makes another run, better or worse by chance alone."""
 
     def taught_by(self, has_map: bool) -> float:
         """The weight of a map's points, by whether there is a map."""

@@ -63,15 +63,15 @@ def adapt(
             (lightdepth-both, lightdepth-self or lightdepth-synthetic).
         more: Folders of other sequences of the same endoscope to learn from as well, such as '[A, B]'; they are read
             with the camera, light and mask of DATA. They do not judge.
-        map: Sparse map of the frames (a SLAM export or a COLMAP model); its points tell the light where nobody gave it,
-            teach, and judge the result. Left out, pycolmap makes one where there is no true distance, or where --points
-            or --overlap is given, but none with --judge none.
+        map: Sparse map of the frames (a SLAM export or a COLMAP model); its points tell the light where none was given,
+            teach the network, and judge the result. Left out, pycolmap makes one where there is no true distance, or
+            where --points or --overlap is given; with --judge none it makes no map.
         fit_light: true: where no light was given, it is fitted on the map, and used if hidden blocks of wall agree with
             it. false: the light of the frames, or an assumed one, is taken as it is.
         sfm: how frames are mapped when there is neither truth nor map
         keep_worse: true: the model is written even where its judge does not find it better. false: then no model is
-            written. Where nothing judges, it is written in either case, but with false only if its answers stayed as
-            steady as before (in mirrored, darker images).
+            written. Where nothing judges, it is written in either case, but with false only if its predictions stayed
+            as steady as before (in mirrored, darker images).
         overwrite: Replace a run made before. Without it, a folder that is already there is refused.
         resume: Go on with the run that was stopped there, as it was begun; a map, a light, the judgement of the start
             and a training that is done are not made again.

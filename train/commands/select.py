@@ -86,8 +86,8 @@ class SelectConfig:
     loftr_nodes: NodeRules = LOFTR_NODES
     """what is covisible and what is kept, with the loftr matcher"""
     bit_depth: Annotated[int | None, Range(8, 32)] = None
-    """Bits of a sample in pictures that are stored in more than 8; left out, what the files say, else what their
-    highest values show. A larger one reads the same numbers as darker."""
+    """Bits per sample of pictures that have more than 8; left out, it is read from the files, else told by their
+    highest values. A larger one reads the same numbers as darker."""
     map_rules: MapRules = field(default_factory=MapRules)
     """what is kept, with --map"""
 

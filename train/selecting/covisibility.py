@@ -253,7 +253,7 @@ def _verdict(seen: Seen, blurred: bool, views_in: Counter[int], good: set[int]) 
 @dataclass(frozen=True)
 @checked
 class MapRules:
-    """Which frames a sparse map vouches for."""
+    """Which frames are kept where a sparse map tells it."""
 
     points: Annotated[int, at_least(1)] = 15
     """Number of map points that two keyframes must both see to count as covisible (seeing the same wall). More keep
@@ -266,7 +266,7 @@ class MapRules:
     for the frames between them to be kept as well; 1 keeps keyframes only. More keep more frames."""
     published: bool = True
     """true: where camerasModel.txt (EndoMapper) lies beside the map, it says which keyframes are covisible, and
-    --map-rules.points is not asked. false: the points always say it."""
+    --map-rules.points has no effect. false: the points always say it."""
 
 
 def select_by_map(
