@@ -105,7 +105,9 @@ class Densified:
         if self.scales is None or not self.scales.all_told:
             return ""
         reach = max(one.reach for one in self.scales.maps) - 1
-        return f"the colour says nothing of the millimetres, which are the light's: nine of ten are within {reach:.0%}"
+        return (
+            f"the colour says nothing about the millimetres, which the light gave: nine of ten are within {reach:.0%}"
+        )
 
     @property
     def verdict(self) -> Verdict | None:
@@ -169,7 +171,7 @@ class Densified:
         if weak:
             notes.append(
                 f"Map {', '.join(weak)} came without observations: which points a keyframe saw was guessed by "
-                "projection, so scales and inliers rest on weaker ground."
+                "projection, so scales and inliers are less certain."
             )
         return notes
 

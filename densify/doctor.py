@@ -104,7 +104,7 @@ def _machine_code() -> Check:
     if folder is None:
         return Check("compiled loops", True, "made by each process: there is no home to keep them in")
     if native.open_to_others(folder):
-        cure = f"what is in it is run: remove it, or chmod 700 {folder} once you know what it holds"
+        cure = f"programs run the code in it: remove it, or chmod 700 {folder} once you know what it holds"
         return Check("compiled loops", False, f"{folder} is another user's, or others may write to it; {cure}")
     return Check("compiled loops", True, f"kept in {folder}")
 
@@ -118,7 +118,7 @@ def _torchvision() -> Check:
         import torchvision  # noqa: F401
     except Exception as error:
         return Check("torchvision", False, f"broken ({error}), and breaks lightning: pip uninstall torchvision")
-    return Check("torchvision", True, "there and loads; not needed")
+    return Check("torchvision", True, "installed, and it loads; not needed")
 
 
 def fused_plane_error(voxel: float = 0.5, distance: float = 30.0) -> tuple[int, float]:

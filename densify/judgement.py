@@ -208,7 +208,7 @@ class Judge:
             alignment = bent(alone, part, k.view.observed, self._config.alignment)
             if alignment.bend is not None:
                 return replace(k, alignment=replace(alignment, unbent_because=kept.reason), bend=part)
-            kept = self._kept[k.keyframe.name] = Kept(0.0, f"{kept.reason}, and its points trust no such part of it")
+            kept = self._kept[k.keyframe.name] = Kept(0.0, f"{kept.reason}, and its points confirm no such part of it")
         alignment = replace(alone, unbent_because=kept.reason)
         level = unbent(replace(k.view, scale=alone.scale), self._config.bending)
         return replace(k, alignment=alignment, bend=level)

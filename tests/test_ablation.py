@@ -254,10 +254,10 @@ def test_a_difference_is_clear_where_its_mean_is_larger_than_its_spread_over_the
     }
     text = markdown(table)
     assert "| worse |  | 1.003 (.900-1.110) | **+.103** | worse |" in text
-    assert "earns its place, all are clearly worse: worse (+.103).\n" in text
-    assert "do not agree on a difference: same (+.033).\n" in text
-    assert "all are worse in every seed, but by less than the seeds differ: perhaps (+.103).\n" in text
-    assert "did harm here, all are clearly better: better (-.100).\n" in text and "one seed: once (+.700)." in text
+    assert "what they leave out earns its place: worse (+.103).\n" in text
+    assert "do not agree on a difference; what they leave out did not help: same (+.033).\n" in text
+    assert "by less than the seeds differ, so that what they leave out may help: perhaps (+.103).\n" in text
+    assert "what they leave out did harm here: better (-.100).\n" in text and "one seed: once (+.700)." in text
     assert not clear(np.array([0.5]))
 
 

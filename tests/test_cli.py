@@ -231,7 +231,7 @@ def test_evaluate_without_truth_shows_the_agreement_with_the_map_beside_a_consta
         found, constant = (each[name]["median"] for name in ("withheld", "withheld_constant"))
         assert f"differs by {found:.1%} (a constant distance by {constant:.1%}) from hidden blocks of the map" in log
     text = (tmp_path / "e" / "metrics.md").read_text()
-    assert "no truth needed" in text and text.count("constant distance") == len(maps)
+    assert "It needs no truth" in text and text.count("constant distance") == len(maps)
     assert text.rstrip() in capsys.readouterr().out
 
 

@@ -186,7 +186,7 @@ def test_it_says_what_would_be_replaced_and_what_is_finished_before(data, tmp_pa
     before = all_below(tmp_path)
     assert lightdepth(*given, "--dry-run") == 3 and "already there" in capsys.readouterr().err
     assert lightdepth(*given, "--dry-run", "--overwrite") == 0
-    assert "in the place of the run that is there" in capsys.readouterr().out
+    assert "in place of the run that is there" in capsys.readouterr().out
     assert lightdepth(*given, "--dry-run", "--resume") == 0 and "already finished" in capsys.readouterr().out
     assert all_below(tmp_path) == before
 

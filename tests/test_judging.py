@@ -111,11 +111,11 @@ def test_white_frames_are_never_green(submap, frames):
     assert judgement.verdict.colour != "green" and "too little texture" in judgement.verdict.sentence
 
 
-def test_images_that_were_not_asked_are_not_said_to_have_too_little_texture(submap, frames):
+def test_images_that_were_not_used_are_not_said_to_have_too_little_texture(submap, frames):
     config = replace(COARSE, judge=JudgeConfig(parallax=ParallaxConfig(on=False)))
     judgement = densify_submap(submap, sequence(frames), truth, config).judgement
     assert judgement is not None and judgement.verdict.colour == "amber"
-    assert "were not asked" in judgement.verdict.sentence and "texture" not in judgement.verdict.sentence
+    assert "were not used" in judgement.verdict.sentence and "texture" not in judgement.verdict.sentence
 
 
 def test_a_part_of_a_bend_that_its_points_do_not_trust_counts_as_undone(submap, frames, monkeypatch):
@@ -125,7 +125,7 @@ def test_a_part_of_a_bend_that_its_points_do_not_trust_counts_as_undone(submap, 
     judgement, result = judged(submap, frames)
     aligned = [a for a in result.dense.alignments if a.ok]
     assert (judgement.undone, judgement.lessened) == (len(aligned), 0)
-    assert all(a.bend is None and "trust no such part" in a.unbent_because for a in aligned)
+    assert all(a.bend is None and "confirm no such part" in a.unbent_because for a in aligned)
 
 
 def test_bends_of_keyframes_that_are_not_in_the_surface_are_not_counted(submap, frames, monkeypatch):
@@ -183,7 +183,7 @@ def speaking_for(share: float, count: int = 900, size: float = 0.1, noise: float
 def test_a_keyframe_keeps_what_the_images_speak_for_of_its_bend(share):
     found = kept({"a": Tried(speaking_for(share), NONE, 0.5)})["a"]
     assert found.share == pytest.approx(share, abs=0.11)
-    assert (found.reason == "") == (found.share == 1) and ("may as well be none" in found.reason) == (found.share == 0)
+    assert (found.reason == "") == (found.share == 1) and ("is as good as none" in found.reason) == (found.share == 0)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])

@@ -27,7 +27,7 @@ def test_the_verdict_on_a_network_is_by_the_closed_form_where_there_is_truth():
 
 def test_a_verdict_on_frames_that_chose_the_checkpoint_says_so():
     errors = {"loss": 0.3, "abs_rel_median": 0.1, "closed_form/abs_rel_median": 0.2}
-    said = "These frames also chose the checkpoint, as the one of their least photometric"
+    said = "These frames also chose the checkpoint, the one with their least photometric"
     assert said in verdict(errors, "photometric") and said in verdict({"loss": 0.3}, "photometric")
     assert "chose" not in verdict(errors)
 
@@ -37,7 +37,7 @@ def test_a_training_leaves_a_page_with_the_verdict_figures_and_frames(tmp_path):
     page = check_self_contained(tmp_path / "run" / "report.html")
     text = (tmp_path / "run" / "report.html").read_text()
     assert text.index("closed form, which needs no training") < text.index("On the validation frames")
-    chosen = "These frames also chose the checkpoint, as the one of their least loss"
+    chosen = "These frames also chose the checkpoint, the one with their least loss"
     assert chosen in text and chosen in (tmp_path / "run" / "model.md").read_text()
     assert len(page.pictures) == 2 * 6 + 1  # a batch of frames, and the decline of light on them
     for label in ("image", "rendered", "distance", "closed form", "truth", "off the truth"):

@@ -122,7 +122,7 @@ def test_a_keyframe_without_a_frame_and_one_whose_frame_is_broken_are_skipped_wi
     read = FrameSequence([f.name for f in frames], load, "the folder")
     result = densify_submap(submap, read, truth, UNJUDGED)
     assert reasons(result) == {
-        "000004.png": "the folder: no frame number 4; expected the frames that the map was made of",
+        "000004.png": "the folder: no frame number 4; expected the frames that the map was made from",
         "000007.png": "000007.png: not a readable image; copy it again",
     }
     assert len(result.dense.aligned) == 8

@@ -64,7 +64,7 @@ def test_a_frame_that_is_lost_or_broken_is_said_and_the_others_go_on():
     played = play(broken, found.map, DECLINE, config, lambda done: surfaces.append(done.dense))
     assert {p.keyframe: p.reason for p in played if p.unread} == {
         "000002.png": "000002: not a readable image; copy it again",
-        "000004.png": "the folder: no frame number 4; expected the frames that the map was made of",
+        "000004.png": "the folder: no frame number 4; expected the frames that the map was made from",
     }
     assert len(surfaces[0].aligned) == 3 and len(surfaces[0].triangles)
     assert time_spent(played, 1e9).read == 3

@@ -150,7 +150,7 @@ def test_the_verb_tells_each_map_with_its_interval_and_measure_reads_it(made, to
     assert main([*argv, "-o", str(made.parent / "length.json")]) == 0
     said = capsys.readouterr().out
     assert "straight 28.3 mm (24 to 33.3)" in said
-    assert "millimetres by the light; nine of ten such figures are right within what stands in brackets" in said
+    assert "millimetres by the light; nine of ten such figures are right within the range in brackets" in said
     length = json.loads((made.parent / "length.json").read_text())
     assert length["unit"] == "mm" and length["scale"]["by"] == "the light"
     low, high = length["intervals"]["straight"]

@@ -154,7 +154,7 @@ def test_a_flag_that_turns_pictures_is_left_aside_and_said(tmp_path, capsys):
     turned = turned_by_flag(plain, tmp_path / "turned" / "a.mp4")
     expected, found = predicted(plain, tmp_path / "a"), predicted(turned, tmp_path / "b")
     assert all(np.array_equal(found[name], expected[name], equal_nan=True) for name in expected)
-    assert any("left aside" in said for said in json.loads((tmp_path / "b" / "run.json").read_text())["warnings"])
+    assert any("it is ignored" in said for said in json.loads((tmp_path / "b" / "run.json").read_text())["warnings"])
     imported(turned, tmp_path / "imported")
     assert "frames are as stored" in findings(tmp_path / "imported")
     assert open_sequence(tmp_path / "imported").image_size() == (256, 208)

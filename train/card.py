@@ -15,8 +15,8 @@ from lightdepth.network import NetworkConfig
 def chosen_said(measure: str) -> str:
     """What errors are worth on frames that chose the checkpoint, in two sentences."""
     return (
-        f"These frames also chose the checkpoint, as the one of their least {measure}: errors on them flatter it. "
-        "Frames that neither taught nor chose say how good it is: predict some that have truth, and evaluate them."
+        f"These frames also chose the checkpoint, the one with their least {measure}: errors on them flatter it. "
+        "To see how good it is, predict and evaluate frames with truth that were used neither to train nor to choose."
     )
 
 

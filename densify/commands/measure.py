@@ -49,7 +49,7 @@ def measure(
             one is another surface.
         mm_per_unit: Millimetres that a unit of the surface stands for, where the run did not know it; lengths are then
             in mm. A larger one makes them longer in proportion. It is refused where the surface is in mm already. Left
-            out, what `lightdepth scale` found of the run, where it found something, with its interval.
+            out, the factor that `lightdepth scale` found for the run, where it found one, with its interval.
         output: JSON file to write the lengths and areas to, besides showing them. Left out, they are shown only.
     """
     if output is not None:
@@ -81,7 +81,7 @@ def measure(
     result["warnings"] = doubts
     outcome().last(found.summary(unit, reach))
     if scale is not None:
-        by = f"millimetres by {scale.by}; nine of ten such figures are right within what stands in brackets"
+        by = f"millimetres by {scale.by}; nine of ten such figures are right within the range in brackets"
         outcome().last(by if known is not None else str(scale))
     if output is not None:
         write_whole(output, json.dumps(plain(result), indent=1) + "\n")

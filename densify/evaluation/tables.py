@@ -236,8 +236,8 @@ def withheld_table(withheld: Sequence[WithheldOfMap]) -> Table:
                 rows.append([where, name, found.points, found.median, found.p90, found.miss])
     title = (
         "Agreement with the sparse map: |distance - point| / point along the ray, of each keyframe's depth as it was "
-        "delivered to the surface, but for the finer grid of its bend, at points in blocks of wall that were hidden "
-        "from the alignment (the median is in densify's log); no truth needed, and no error either."
+        "delivered to the surface, without the finer grid of its bend, at points in blocks of wall that were hidden "
+        "from the alignment (the median is in densify's log). It needs no truth, and it is no error."
     )
     return Table(title, ["Map", "Depth", "Points", "Median", "90th percentile", "Share that misses"], rows)
 

@@ -117,8 +117,8 @@ def _by_images(errors: np.ndarray, level: _Share) -> Kept:
     share = _rounded(found)
     if share == 1:
         return Kept(1.0)
-    wrong = f"the images speak for {max(found, 0):.0%} of the bend to the map's points"
-    return Kept(share, wrong if share else f"{wrong}, which may as well be none")
+    wrong = f"the images support {max(found, 0):.0%} of the bend to the map's points"
+    return Kept(share, wrong if share else f"{wrong}, which is as good as none")
 
 
 def _rounded(share: float) -> float:

@@ -193,7 +193,7 @@ def _verdict(j: Judgement) -> Verdict:
         said, red, amber = _by_images(j.surface)
     else:
         said = "the images have too little texture or parallax to judge by"
-        said = said if j.asked else "the images were not asked (--judge.parallax.on false)"
+        said = said if j.asked else "the images were not used (--judge.parallax.on false)"
         said += f"; hidden blocks of the map's wall are {_share(number)} off"
         red, amber = ([], [said]) if number <= RED else ([said], [])
     amber += _few(j.keyframes, j.aligned)
@@ -236,7 +236,7 @@ def ahead_verdict(
         f"new points of the map are {_share(by_points)} from the depth that was there before them, in the median "
         f"({columns.count} points; a constant distance {_share(columns.constant)})"
     )
-    alone = "the map alone was asked, not the images"
+    alone = "only the map judged this, not the images"
     colour = "red" if by_points > RED else "amber"
     return Verdict(colour, "; ".join([said, alone, *few, *merit]), by_points, "map")
 

@@ -51,8 +51,9 @@ def _agreement(page: Report, judged: Mapping[int, Ahead], played: Sequence[Playe
         "How far the depth of the last aligned keyframe is from points that the map measured after it, as a share, in "
         "the median. This is agreement, not error: map and surface may have drifted together. New points lie beside "
         "points that were used, at the rim of what was known. A constant distance gets the same help, one scale or a "
-        "bend, and is asked at the same points. When a surface is finished, the images are asked as well: distances by "
-        "parallax between its keyframes, which nothing was fitted to. Where they speak, the verdict is by them."
+        "bend, and is compared at the same points. When a surface is finished, the images judge it as well, by "
+        "distances from parallax between its keyframes, which nothing was fitted to. Where they can judge, the verdict "
+        "is theirs."
     )
     rows = []
     for number, found in judged.items():

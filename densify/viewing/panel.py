@@ -53,8 +53,8 @@ class Panel:
         gui.main_panel.dock_right()
         note = gui.add_html("")
         with gui.add_folder("Maps") as maps:
-            together = gui.add_html(_text("Each map has a frame of reference of its own: shown together, they do not "
-                                          "lie to each other as they do in the body."), visible=False)  # fmt: skip
+            together = gui.add_html(_text("Each map has a frame of reference of its own: shown together, maps are "
+                                          "not placed as they are in the body."), visible=False)  # fmt: skip
         with gui.add_folder("Shown"):
             layer = gui.add_dropdown("Colour", ("Of the images",), hint="What the colours of the surface tell")
             legend = gui.add_html("")

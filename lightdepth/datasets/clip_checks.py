@@ -28,7 +28,7 @@ def _of_file(clip: Clip) -> list[str]:
     found = []
     if clip.rotation:
         found.append(
-            f"a flag asks players to turn the pictures by {clip.rotation} degrees; it is left aside: pixels are taken "
+            f"a flag asks players to turn the pictures by {clip.rotation} degrees; it is ignored: pixels are taken "
             "as they are stored, and so are camera, mask and map (ffmpeg and OpenCV turn them)"
         )
     if (steps := uneven(clip.times)) is not None:

@@ -112,7 +112,7 @@ class FrameSequence(Sequence[Frame]):
         number = counting.number(keyframe)
         frame = self.by_number(number)
         if frame is None:
-            raise InputError(self.source, f"no frame number {number}", "expected the frames that the map was made of")
+            raise InputError(self.source, f"no frame number {number}", "expected the frames that the map was made from")
         return replace(frame, camera=keyframe.camera)
 
 

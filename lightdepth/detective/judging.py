@@ -133,30 +133,30 @@ def _said(found: Findings) -> tuple[Judgement, str, str]:
     best = _best(found, "wins")
     if best is not None:
         reading, fit = best
-        sure = "" if fit.likeness >= _SURELY else " (if these are the frames that the map was made of)"
+        sure = "" if fit.likeness >= _SURELY else " (if these are the frames that the map was made from)"
         return "wrong", f"{alike}, but {_figures(fit)} if {reading.name}", f"{reading.cure}{sure}, {_TRUST}"
     if found.from_chance < _CHANCE:
         said = f"{alike}, no more than patches around different points ({found.from_chance:.0%} of pairs are told)"
-        return "wrong", said, f"are these the frames that the map was made of? Give those, {_TRUST}"
+        return "wrong", said, f"are these the frames that the map was made from? Give those, {_TRUST}"
     away = max(found.elsewhere, key=lambda fit: fit.better, default=None)
     far = "" if away is None else f"{alike}, and {_figures(away)} in frames far away from those that they are taken for"
     if away is not None and away.better >= _COIN:
-        return "wrong", far, f"are these the frames that the map was made of? Give those, {_TRUST}"
+        return "wrong", far, f"are these the frames that the map was made from? Give those, {_TRUST}"
     strange, share = found.strange, len(found.strange) / at_hand.keyframes
     odd = f"{alike}, but {len(strange)} of {at_hand.keyframes} keyframes ({', '.join(strange[:4])}) are no more like "
     odd += "each other than frames far away from them"
     if share >= _MANY_STRANGE:
-        return "wrong", odd, f"do all keyframes belong to these frames? Give those that the map was made of, {_TRUST}"
+        return "wrong", odd, f"do all keyframes belong to these frames? Give those that the map was made from, {_TRUST}"
     rival = _best(found, "rivals")
     if rival is not None:
         return "doubtful", f"{alike}, and {_figures(rival[1])} if {rival[0].name}", rival[0].cure
     if away is not None and away.better > _ELSEWHERE:
-        return "doubtful", far, "are these the frames that the map was made of?"
+        return "doubtful", far, "are these the frames that the map was made from?"
     if share >= _SOME_STRANGE:
         return "doubtful", odd, "do all keyframes belong to these frames?"
     if found.from_chance < _HARDLY:
         said = f"{alike}, little more than patches around different points ({found.from_chance:.0%} of pairs are told)"
-        return "doubtful", said, "are these the frames that the map was made of?"
+        return "doubtful", said, "are these the frames that the map was made from?"
     if of_geometry is not None:
         return of_geometry
     return "agrees", f"frames and map agree: {alike}, and no other reading fits better", ""

@@ -66,7 +66,7 @@ def other_rates(last: int) -> list[Reading]:
             name = f"the video has {rate:.4g} times as many frames a second as the map's times were counted with"
             cure = (
                 f'multiply --map-fps, or "fps" in {SIDECAR} beside the map, by {rate:.4g} ({true:g} for {assumed:g}, '
-                "say), or give the frames that the map was made of"
+                "say), or give the frames that the map was made from"
             )
             found.setdefault(round(rate * last), Reading(name, cure, Counting(rate)))
     return list(found.values())
@@ -76,7 +76,7 @@ def other_images(camera: CameraModel, of_frames: CameraModel | None) -> list[Rea
     """The images are not those that the map's camera took, but the same changed. `of_frames` is the frames' own
     camera, where they have one."""
     width, height = float(camera.width), float(camera.height)
-    unlike = "give the images that the map was made of, or a map made of these"
+    unlike = "give the images that the map was made from, or a map made from these"
 
     def mirrored(x: bool, y: bool) -> PixelMap:
         return lambda pixels: np.where([x, y], (width, height) - pixels, pixels)
@@ -92,7 +92,7 @@ def other_images(camera: CameraModel, of_frames: CameraModel | None) -> list[Rea
         found.append(
             Reading(
                 "the images are undistorted and the map's keypoints are not",
-                "give the images as the camera took them, or a map made of the undistorted ones",
+                "give the images as the camera took them, or a map made from the undistorted ones",
                 moved=lambda pixels: _undistorted(camera, pixels),
             )
         )
@@ -121,7 +121,7 @@ def _of_other_size(much: str, scale: float) -> Reading:
     return Reading(
         f"the map's keypoints are those of images {much} as large as its camera says",
         "correct width and height of the map's camera, with its focal length and principal point, or give the frames "
-        "that the map was made of",
+        "that the map was made from",
         moved=lambda pixels: pixels / scale,
     )
 

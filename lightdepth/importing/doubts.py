@@ -47,7 +47,7 @@ def doubts(
             Finding(
                 f"Burnt-in text or graphics in {counted(len(regions.overlay.boxes), 'place')}: {boxes}. They are "
                 "black in the frames and invalid in the mask.",
-                "Look at the frames before they leave the house: text that shows only briefly is not found; black it "
+                "Look at the frames before you hand them on: text that shows only briefly is not found; black it "
                 "out with --overlay-mask FILE.",
             )
         )

@@ -28,8 +28,8 @@ def board_page(found: BoardFit, what: str) -> Report:
     ]
     page.table(["from the camera's centre", "found", "half of the 90 % interval", "standard deviation"], rows)
     page.text(
-        "The interval is the larger one of what frames drawn anew show and what the fit itself says. It does not hold "
-        "what the model leaves out: gloss, a bent board, tone mapping."
+        "The interval is the larger of two: that of fits to frames drawn anew, and that of the fit itself. It does not "
+        "contain what the model leaves out: gloss, a bent board, tone mapping."
     )
     if len(lamps.shares) > 1:
         page.heading("Lamps")

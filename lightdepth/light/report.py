@@ -38,8 +38,8 @@ def light_page(fit: LightFit, what: str) -> Report:
     page.text("Standard deviations come from a bootstrap over keyframes; they do not contain errors of the model.")
     if on_map:
         page.text(
-            "A map knows no normals: this is the light with which the closed form errs least, every wall taken as "
-            "facing. In a tube its gamma is smaller than the endoscope's own, light from wall to wall makes it larger."
+            "A map has no normals: this is the light with which the closed form errs least if all wall faces the "
+            "camera. In a tube that makes gamma smaller than the endoscope's; light from wall to wall makes it larger."
         )
     fitted_to = f"Fitted to {fit.points} points of {fit.keyframes[0]} keyframes, judged"
     if on_map:

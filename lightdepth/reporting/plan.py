@@ -37,7 +37,7 @@ class Plan:
     def __init__(self, output: Path, parts: int = 0, again: str = "") -> None:
         self._output = output
         there = output.is_dir() and any(output.iterdir()) and not again
-        how = ", in the place of the run that is there" if there else ""
+        how = ", in place of the run that is there" if there else ""
         how += f", {again}" if again else f", going on from {counted(parts, 'finished part')}" if parts else ""
         self._made = f"would make {output}{how}"
 

@@ -43,7 +43,7 @@ def predicted_page(
         page.text(
             "Distance: yellow near, violet far, each frame with a range of its own, as distance is known up to one "
             f"factor a frame. Uncertainty: violet sure, yellow {UNSURE:.0%} of the distance and more. Normals: red to "
-            "the right, green up, blue towards the camera. Black is where nothing is said."
+            "the right, green up, blue towards the camera. Black: no value."
         )
         for frame, prediction in shown:
             page.tiles(_tiles(frame, prediction), frame.name, 190)

@@ -35,11 +35,11 @@ _SHOWN_POINTS = 6
 _IN_EVERY_SEED = "in every seed, but by less than the seeds differ"
 _HEADINGS = {
     "dropped": {
-        "worse": "What these rows leave out earns its place, all are clearly worse",
-        "worse in every seed": f"What these leave out may help, all are worse {_IN_EVERY_SEED}",
-        "no clear difference": "What these leave out did not help, the seeds do not agree on a difference",
-        "better in every seed": f"What these leave out may harm, all are better {_IN_EVERY_SEED}",
-        "better": "What these leave out did harm here, all are clearly better",
+        "worse": "Rows that are clearly worse, so that what they leave out earns its place",
+        "worse in every seed": f"Rows that are worse {_IN_EVERY_SEED}, so that what they leave out may help",
+        "no clear difference": "Rows whose seeds do not agree on a difference; what they leave out did not help",
+        "better in every seed": f"Rows that are better {_IN_EVERY_SEED}, so that what they leave out may harm",
+        "better": "Rows that are clearly better, so that what they leave out did harm here",
         "one seed": "Left out with one seed",
     },
     "instead": {

@@ -166,8 +166,8 @@ def notes(cells: Sequence[CellFigures]) -> list[str]:
     said = [
         f"Unit: {UNIT}. Alignment: {ALIGNMENT}.",
         f'"{BEST_SHIFT}" is, colon by colon, the better of two by AbsRel against truth: {"; ".join(which)}.',
-        f'"{OURS}" has points and predictions alone, as the others; "{DELIVERED}" is what the verb delivers, whose '
-        "images lessen bends, and of whose surface contradicted pixels are left out.",
+        f'"{OURS}" has points and predictions alone, as the others; "{DELIVERED}" is what the verb delivers: images '
+        "lessen its bends, and contradicted pixels are left out of its surface.",
     ]
     for cell in cells:
         lacking = {name: row for name, row in cell.rows.items() if name not in METHODS}
