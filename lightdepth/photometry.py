@@ -68,7 +68,7 @@ class MeasuredLamps:
 class PhotometricCalibration:
     """Light and response of one endoscope. `position_mm` in camera axes; `direction` is normalised at birth.
 
-    `reflectance` is the share of light that the wall throws back for others to receive (radiosity's rho).
+    `reflectance` is the share of light that the wall reflects for other wall to receive (radiosity's rho).
     `source` says where the numbers come from: measured, fitted (on a sparse map, whose light explains its points best
     and need not be the endoscope's own), published, given (by somebody who did not say) or assumed. `lamps` is what is
     known besides of a light whose position was measured: only what looks for millimetres takes each lamp, all else the

@@ -50,9 +50,9 @@ class TubeData:
     reflects onto other wall. A larger one makes more indirect light."""
     family: Family = "plain"
     """Kind of colons: plain, tubes with folds under the endoscope's light; realistic, with polyps, mucus, motion blur
-    and whatever else real images have; mixed, as realistic, but one scene of five is a cavity of any shape instead, and
-    each has a round or eight-sided field of view of its own; wide, as mixed, over wider ranges of shape, paint and
-    exposure, with the light between walls computed in a way that changes from colon to colon."""
+    and whatever else real images have; mixed, as realistic, but one scene of five is a hollow, a cavity of any shape,
+    instead, and each has a round or eight-sided field of view of its own; wide, as mixed, over wider ranges of shape,
+    paint and exposure, with the light between walls computed in a way that changes from colon to colon."""
     val_family: Family | Literal["variant"] | None = None
     """Kind of colons to validate on, and to scale the uncertainty by: one of the families, or variant, which is made in
     another way than all of them. Left out, the kind that is trained on."""

@@ -30,7 +30,7 @@ Size = Literal["small", "full"]
 class Scene:
     """One sequence. `frames` of it were seen by the SLAM, in `maps` submaps, and `keyframes` were kept; `wall` is how
     the colon is made (of another make than any that a checkpoint was trained on: "other"), `mu` how the light fades
-    to the side (the wider, the smaller), `reflectance` how much of it the walls throw at each other."""
+    to the side (the wider, the smaller), `reflectance` how much of it the walls reflect onto each other."""
 
     name: str
     seed: int

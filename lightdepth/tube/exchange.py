@@ -1,6 +1,6 @@
 """How much of the light that leaves one patch of wall falls on another: several answers, each wrong in its own way.
 
-A network that is taught by one way of reckoning the light between walls learns to undo that way, flaws and all. So the
+A network that is taught by one way of computing the light between walls learns to undo that way, flaws and all. So the
 colons of a training may each take another. Notation: N patches, K (N, N) form factors, rows receive; E irradiance, rho
 reflectance; E = E_0 + K rho E, summed over so many bounces.
 """

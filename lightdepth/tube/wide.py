@@ -1,6 +1,6 @@
 """Colons and hollows beyond the realistic: what is drawn for networks that must hold under a renderer they never met.
 
-Against `realistic` and `cavity`: light between walls reckoned in four ways and to the last bounce, reflectance as far
+Against `realistic` and `cavity`: light between walls computed in four ways and to the last bounce, reflectance as far
 as the caller goes, exposure from dark to hard clipped, and wider ranges of shape, paint, gloss and lamp.
 """
 
