@@ -14,6 +14,7 @@ from lightdepth.camera import KannalaBrandt, Pinhole, Scaramuzza
 from lightdepth.files.images import to_bgr8
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.tube import Tube, camera_path, lens, octagon, render_sequence, tube_frames
+from lightdepth.tube.shape import ShapeConfig, make_shape
 from lightdepth.tube.slam import SlamConfig, simulate_slam
 
 
@@ -69,6 +70,14 @@ def test_poses_are_rotations_and_travel_as_far_as_asked():
     assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum() == pytest.approx(15, rel=0.5)
     still = camera_path(shape, 1, 15.0, np.random.default_rng(1))
     assert np.isfinite(still).all()
+
+
+def test_a_way_that_is_longer_than_its_colon_is_refused():
+    """It left the tube at its end, and frames and maps were of nothing."""
+    shape = make_shape(ShapeConfig(length=60.0, radius=(15.0, 15.1)), np.random.default_rng(0))
+    assert len(camera_path(shape, 3, 40.0, np.random.default_rng(1))) == 3
+    with refused(where="the endoscope's way", found="950 mm, in a colon of 60", cure="at most 43 mm"):
+        camera_path(shape, 3, 950.0, np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("seed", [0, 1])

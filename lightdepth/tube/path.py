@@ -22,6 +22,12 @@ from lightdepth.tube.shape import TubeShape
 Lens = Literal["pinhole", "telescope", "fisheye", "c3vd"]
 
 
+_FIRST = 8.0, 9.0
+"""Where a path begins at the earliest, and at the latest in a tube that is no longer than it, mm."""
+_CLOSING = 0.6
+"""Mean radii over which a tube closes at its end (lightdepth.tube.shape)."""
+
+
 @dataclass(frozen=True)
 @checked
 class PathConfig:
@@ -77,10 +83,17 @@ def camera_path(
     start: float | None = None,
     config: PathConfig = PathConfig(),
 ) -> np.ndarray:
-    """Poses world_from_cam (count, 4, 4) [mm]: `travel` mm along the tube, with sway and looking about."""
-    length = (len(shape.centers) - 1) * shape.step
-    latest = max(9.0, length - travel - 2.5 * float(shape.radius.mean()))
-    first = rng.uniform(8.0, latest) if start is None else start
+    """Poses world_from_cam (count, 4, 4) [mm]: `travel` mm along the tube, with sway and looking about. Raises
+    InputError where the tube is not as long as that."""
+    length, radius = (len(shape.centers) - 1) * shape.step, float(shape.radius.mean())
+    if (longest := length - _FIRST[1] - _CLOSING * radius) < travel:
+        raise InputError(
+            "the endoscope's way",
+            f"{travel:g} mm, in a colon of {length:g} mm",
+            f"expected at most {max(longest, 0.0):.0f} mm here, or a longer colon (shape.length)",
+        )
+    latest = max(_FIRST[1], length - travel - 2.5 * radius)
+    first = rng.uniform(_FIRST[0], latest) if start is None else start
     s = first + np.linspace(0, travel, count)
     smooth = max(2.0, count / 5)
 
