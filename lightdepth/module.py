@@ -84,7 +84,7 @@ class LightDepth(pl.LightningModule):
         self.loss_config = loss
         self.learning_rate, self.weight_decay, self.rows = learning_rate, weight_decay, rows
         self.schedule, self.freeze_distance = schedule, freeze_distance
-        self.pretrained, self.start = pretrained, start
+        self.began_with = pretrained, start
         self.network = build_network(network)
         if pretrained is not None:
             load_pretrained(self.network, pretrained)

@@ -11,9 +11,10 @@ import torch
 from raising import refused
 
 from lightdepth.errors import MachineFailure
-from train.fit import _apart_named, _refusals_named
+from train.fit import _refusals_named
 from train.folder import first_process
 from train.running import NO_ROOT, trainer_of_one
+from train.together import ending_together
 from train.watching import with_callbacks
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,7 +37,10 @@ def test_a_job_that_lightning_cannot_run_in_is_told_as_a_mistake():
 
 
 def test_processes_that_do_not_meet_are_a_failure_of_the_machine_s():
-    with pytest.raises(MachineFailure, match=r"do not meet \(port taken\): .*MASTER_PORT"), _apart_named():
+    with (
+        pytest.raises(MachineFailure, match=r"do not meet \(port taken\): .*MASTER_PORT"),
+        ending_together(trainer_of_one()),
+    ):
         raise torch.distributed.DistNetworkError("port taken\nand where")
 
 

@@ -84,7 +84,7 @@ def test_poses_whose_columns_nobody_named_are_refused_with_what_to_do(rendered):
     file = trajectory(rendered)
     file.write_text(file.read_text().split("\n", 1)[1])
     with refused(where=".csv", found="the first line is", cure="expected a header that names tX tY tZ"):
-        open_sequence(rendered)
+        list(open_sequence(rendered))
     file.unlink()
     assert open_sequence(rendered)[0].true_world_from_cam is None
 
@@ -103,14 +103,14 @@ def test_poses_that_are_none_are_refused_by_line(rendered, line, message):
     lines[2] = line.replace(",", ";" if ";" in lines[0] else ",")
     file.write_text("\n".join(lines) + "\n")
     with refused(message):
-        open_sequence(rendered)
+        list(open_sequence(rendered))
 
 
 def test_a_simulated_sequence_that_does_not_say_its_unit_or_camera_is_refused(tmp_path):
     write_endoslam(colon(0).frames[:2], tmp_path, simulated=True)
     (tmp_path / "info.txt").write_text("units: admiral\n")
     with refused(where="info.txt", found="does not say that lengths are in dm"):
-        open_sequence(tmp_path)
+        list(open_sequence(tmp_path))
     (tmp_path / "trajectory.csv").unlink()
     (tmp_path / "calibration.txt").write_text("fx: 52\nfy: 52\n")
     with refused(where="calibration.txt", found="cols, rows, cx, cy missing", cure="expected lines such as `fx: 400"):

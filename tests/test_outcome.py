@@ -18,6 +18,7 @@ from threading import Barrier, BrokenBarrierError
 import pytest
 from test_options import every_verb, parsers
 
+from lightdepth.checkpoint import bundled
 from lightdepth.cli import main
 from lightdepth.command_line.outcome import Outcome, end, manners, outcome, speaking
 from lightdepth.command_line.parsing import Parser
@@ -304,6 +305,15 @@ def test_bash_completes_verbs_options_choices_and_files(scripts, tmp_path):
     assert "--external" in after("lightdepth bench completion --ext")
     assert after("lightdepth densify my_f") == {"my_frames.mp4"}
     assert after("lightdepth densify my_frames.mp4 --map my_m") == {"my_map"}
+    assert after("lightdepth densify x --checkpoint ") == {"my_map", "my_frames.mp4", "decline", "constant", *bundled()}
+    assert after("lightdepth export ") >= {"my_map", *bundled()} and "decline" not in after("lightdepth export ")
+    for words in ("predict x --checkpoint", "bench --checkpoints", "adapt x --checkpoint", "train --model.start"):
+        assert after(f"lightdepth {words} lightdepth-b") == {"lightdepth-both"}, words
+
+
+def test_every_shell_offers_the_depth_models_that_come_with_the_program(scripts):
+    for shell in SHELLS:
+        assert all(name in scripts[shell].read_text() for name in [*bundled(), "decline"])
 
 
 def test_a_tab_starts_no_python(scripts):

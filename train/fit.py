@@ -27,7 +27,7 @@ from lightdepth.checkpoint import load_model, save_model
 from lightdepth.command_line.dry import is_dry
 from lightdepth.counting import counted
 from lightdepth.datasets.no_camera import NoCamera
-from lightdepth.errors import InputError, Interrupted, MachineFailure
+from lightdepth.errors import InputError, Interrupted
 from lightdepth.files.named_inputs import write_inputs
 from lightdepth.files.replacing import output_of, read_record, unfinished_path
 from lightdepth.files.writing import sync_below, write_whole
@@ -53,6 +53,7 @@ from .going_on import settings_before, warn_of_length, warn_of_settings
 from .report import FILES, show_frames, training_page
 from .requeue import requeued
 from .running import NO_ROOT, while_training
+from .together import ending_together, look_after_each_other
 from .trained_card import TrainedCard, shared_by, trained_on
 from .trainer_options import check_trainer_options
 from .watching import Echo, FitConfig
@@ -190,16 +191,18 @@ def _fitted(
             data.go_on(start.epoch, start.batch)
             warn_of_length(echo, model, start, trainer.max_steps)
             warn_of_settings(echo, before, names.hidden(asked["settings"], exactly=True))
-        with _refusals_named(MisconfigurationException), _apart_named():
+        look_after_each_other(trainer, received)
+        with _refusals_named(MisconfigurationException), ending_together(trainer):
             path = None if start is None else start.path
             trainer.fit(model, datamodule=data, ckpt_path=path, weights_only=True)
         train_loss = trainer.callback_metrics.get("train/loss")
         received.stop(f"all steps are kept in {LAST}: --resume exports the model")
 
     chosen = exported_of(checkpoints, job.settings.monitor != "last")
-    found = trainer.validate(model, datamodule=data, ckpt_path=chosen, verbose=False, weights_only=True)[0]
+    with ending_together(trainer):
+        found = trainer.validate(model, datamodule=data, ckpt_path=chosen, verbose=False, weights_only=True)[0]
+        data.gather()
     errors = {key.removeprefix("val/"): float(value) for key, value in found.items()}
-    data.gather()
     if trainer.is_global_zero:
         final = f"train loss {float(train_loss):.4g}  " if train_loss is not None else ""
         echo(f"final: {final}{validation_line(found)}")
@@ -302,17 +305,6 @@ def _refusals_named(*kinds: type[Exception]) -> Iterator[None]:
     except kinds as error:
         found = " ".join(str(error).split()).rstrip(".")
         raise InputError("--trainer", f"Lightning says: {found}", "see lightdepth train --help-all") from error
-
-
-@contextmanager
-def _apart_named() -> Iterator[None]:
-    """What is said where the processes of a run do not come together, or lose each other."""
-    try:
-        yield
-    except torch.distributed.DistError as error:
-        found = str(error).splitlines()[0]
-        cure = "does each machine reach MASTER_ADDR at a MASTER_PORT that nothing else takes, and do all still run?"
-        raise MachineFailure(f"the processes that train together do not meet ({found}): {cure}") from error
 
 
 @torch.no_grad()

@@ -52,13 +52,13 @@ def trained_on(model: LightDepth, data: FrameDataModule) -> str:
 def _began_with(model: LightDepth) -> str:
     """What others trained, in a sentence, and thereby which images it saw besides; a file is told by its hash, as its
     name may be a patient's."""
-    said = ""
-    if model.pretrained is not None:
-        what = "ImageNet" if model.pretrained == IMAGENET else f"the file {input_hash(Path(model.pretrained))[:8]}"
+    said, (encoder, start) = "", model.began_with
+    if encoder is not None:
+        what = "ImageNet" if encoder == IMAGENET else f"the file {input_hash(Path(encoder))[:8]}"
         said = f" Its encoder began with the weights of {what}."
-    if model.start is not None:
-        named = model.start in bundled() or model.start.startswith(HUB)
-        what = model.start if named else f"the checkpoint {input_hash(Path(model.start))[:8]}"
+    if start is not None:
+        named = start in bundled() or start.startswith(HUB)
+        what = start if named else f"the checkpoint {input_hash(Path(start))[:8]}"
         said += f" All its weights began with those of {what}."
     return said
 

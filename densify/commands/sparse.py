@@ -94,18 +94,20 @@ def sparse(
         if repair is not None:
             map_and_frames(run, source, MapSource.read_as(repair, reading, repair_map=True), sfm)
         else:
-            frames = open_frames(source, run, None, sfm).without_truth()
+            frames = open_frames(source, run, None, sfm)
             known = None if poses is None else _poses(poses, frames, source, reading)
-            made_sparse(run, frames, sfm, known, source.image_files)
+            made_sparse(run, frames.without_truth(), sfm, known, source.image_files)
     end(output, then=f"lightdepth densify DATA --map {quote(str(output / 'sparse'))} -o runs/dense")
 
 
 def _poses(given: str, frames: FrameSequence, source: SequenceSource, reading: MapReading) -> dict[int, np.ndarray]:
     """Known poses (4, 4) by frame number."""
     if given == "truth":
-        found = ((f.number, f.true_world_from_cam) for f in readable(frames, range(len(frames))))
+        blind = frames.without_truth()
+        found = ((f.number, f.true_world_from_cam) for f in readable(blind, range(len(blind))))
         known = {number: pose for number, pose in found if pose is not None}
         if not known:
+            frames.first()  # says why, where those that there are cannot be read
             raise InputError(frames.source, "no frame has a pose", "give --poses FILE, a TUM trajectory")
         return known
     times, poses = read_tum(Path(given))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
+import gc
 import os
 
 _MB = 1 << 20
@@ -12,13 +14,15 @@ system each time, how much may be kept at the end of the heap, and by how much i
 
 
 def set_own_process() -> None:
-    """One thread for the solvers, and an allocator that keeps what was freed; what the user has set holds.
+    """One thread for the solvers, and an allocator that keeps what was freed; what the user has set holds. An end that
+    does not look through all objects, several times, for what nobody needs any more.
 
     Systems that are solved are many and small: threads of each would wait for each other, for long where a container or
     other work leaves fewer cores than the machine has. Images and feature maps of a few megabytes come and go all the
     time, and by default each goes back to the system, which hands out new pages, one by one and full of zeros.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    atexit.register(gc.freeze)
     if not any(name.startswith("MALLOC_") for name in os.environ):
         _keep_freed_memory()
 

@@ -20,8 +20,10 @@ from lightdepth.command_line.words import dashed, options
 if TYPE_CHECKING:
     from lightdepth.command_line.parsing import Parser
 
-_NAME_FILES = ("config", "output", "checkpoint", "checkpoints", "light", "poses", "what", "data.sequences")
+_NAME_FILES = ("config", "output", "light", "poses", "data.sequences")
 """Options of type text that name a file, or may."""
+_NAME_MODELS = ("checkpoint", "checkpoints", "what", "model.start")
+"""Options that name a depth model: a file, or one that comes with the program."""
 _PLACES = {
     "bash": "~/.local/share/bash-completion/completions/lightdepth",
     "zsh": "FOLDER/_lightdepth",
@@ -81,8 +83,30 @@ def _add_options(made: argparse.ArgumentParser, parser: Parser, verb: str) -> No
             words.append("--help-all")
         added = made.add_argument(*(words or [action.dest]), **given)
         kind = getattr(action, "_typehint", None)
-        if added.choices is None and (Path in leaves(kind) or action.dest in _NAME_FILES):
-            added.complete = shtab.FILE  # type: ignore[attr-defined]  # shtab's way
+        if added.choices is None and action.dest in _NAME_MODELS:
+            with_weights = verb == "adapt" or action.dest in ("what", "model.start")
+            added.complete = _files_and_models(with_weights)  # type: ignore[attr-defined]  # shtab's way
+        elif added.choices is None and (Path in leaves(kind) or action.dest in _NAME_FILES):
+            added.complete = shtab.FILE  # type: ignore[attr-defined]
+
+
+def _files_and_models(with_weights: bool) -> dict[str, Any]:
+    """What completes the name of a depth model, by shell: those that come with the program, of which some have no
+    weights, and files."""
+    import shtab
+
+    from lightdepth.checkpoint import TRAINING_FREE, bundled
+
+    names = " ".join([*bundled(), *(() if with_weights else TRAINING_FREE)])
+    function = f"_lightdepth_files_and_{'networks' if with_weights else 'models'}"
+    bash = f'{function}() {{\n  compgen -f -- "$1"\n  compgen -W \'{names}\' -- "$1"\n}}'
+    zsh = f"{function}() {{\n  _alternative 'models:depth model:({names})' 'files:file:_files'\n}}"
+    return {
+        "bash": function,
+        "zsh": function,
+        "fish": f"{shtab.FILE['fish']} {names}",
+        "preamble": {"bash": bash, "zsh": zsh},
+    }
 
 
 def _choices(action: argparse.Action, verb: str) -> Iterator[str]:

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from lightdepth.camera import CameraModel, Pinhole, Scaramuzza
-from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
+from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of, poses_or_why
 from lightdepth.datasets.sequence import FrameSequence, corners, numbered_files, spread_images
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
@@ -120,13 +120,6 @@ def read_c3vd(
     depth = numbered_files(path / tree.depth, r"(\d+)_depth\.tiff")
     images = [colour[n] for n in sorted(colour)]
     numbers = checked_images(path, images, depth)
-    poses = _read_poses(path / "pose.txt") if (path / "pose.txt").is_file() else None
-    if poses is not None and numbers[-1] >= len(poses):
-        raise InputError(
-            f"{path / 'pose.txt'}",
-            f"{len(poses)} poses, but there is a frame {numbers[-1]}",
-            "expected a line for each frame, from frame 0",
-        )
     if camera is None:
         width, height = image_size(images[0])
         undistorted = (path / "color_raw").is_dir() or _fills_the_corners(spread_images(images))
@@ -149,7 +142,7 @@ def read_c3vd(
         mask,
         names=names,
         times=[number / 30.0 for number in numbers],
-        poses=None if poses is None else poses[numbers],
+        poses=poses_or_why(lambda: _poses_of(path, numbers)),
         distance=lambda i: _DEPTH.distance(depth[numbers[i]], ray_z) if numbers[i] in depth else None,
         bit_depth=bit_depth,
         bordered=True,
@@ -216,6 +209,20 @@ def _tree(path: Path) -> _Tree | None:
 
 def _colour(path: Path, tree: _Tree) -> dict[int, Path]:
     return numbered_files(path / tree.colour, rf"(\d+){re.escape(tree.suffix)}")
+
+
+def _poses_of(path: Path, numbers: list[int]) -> np.ndarray | None:
+    """(n, 4, 4) world_from_cam [mm] of the frames with these numbers; None where there is no file."""
+    if not (path / "pose.txt").is_file():
+        return None
+    poses = _read_poses(path / "pose.txt")
+    if numbers[-1] >= len(poses):
+        raise InputError(
+            f"{path / 'pose.txt'}",
+            f"{len(poses)} poses, but there is a frame {numbers[-1]}",
+            "expected a line for each frame, from frame 0",
+        )
+    return poses[numbers]
 
 
 def _read_poses(path: Path) -> np.ndarray:

@@ -100,7 +100,7 @@ def unusable_truth(sequence: FrameSequence) -> list[str]:
 
 
 def _looked_at(sequence: FrameSequence, rows: Iterable[int]) -> tuple[list[Frame], list[str]]:
-    """The frames that can be read, some without their true distance, and why that cannot be read of the first."""
+    """The frames that can be read, some without their truth, and why that cannot be read of the first."""
     frames, no_truth = [], []
     blind = sequence.without_truth()
     for i in rows:
@@ -109,7 +109,7 @@ def _looked_at(sequence: FrameSequence, rows: Iterable[int]) -> tuple[list[Frame
         except InputError as error:
             with suppress(InputError):
                 frames.append(blind[i])
-                no_truth.append(f"the true distance of {sequence.names[i]} cannot be read ({error})")
+                no_truth.append(f"the truth of {sequence.names[i]} cannot be read ({error})")
     return frames, no_truth[:1]
 
 

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole, camera_from_params
-from lightdepth.datasets.format import Format, frames_of
+from lightdepth.datasets.format import Format, frames_of, poses_or_why
 from lightdepth.datasets.sequence import FrameSequence, list_images, numbered_files
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
@@ -87,10 +87,9 @@ def read_endoslam(
                 f"fy, cx, cy]}}) and give it with {option('camera')}",
             )
         camera = _read_calibration(file) if _simulated(path) else read_camera(file, (width, height))
-    poses = _poses(path)
-    of_images = [poses.get(frame_number(image.name)) for image in images]
+    poses = poses_or_why(lambda: _poses_of(path, images))
     light = light or PhotometricCalibration()
-    return frames_of(path, images, camera, light, mask, poses=of_images, bit_depth=bit_depth, bordered=True)
+    return frames_of(path, images, camera, light, mask, poses=poses, bit_depth=bit_depth, bordered=True)
 
 
 FORMAT = Format(
@@ -165,6 +164,11 @@ def _read_calibration(path: Path) -> CameraModel:
         )
     width, height, *params = (found[name] for name in names)
     return camera_from_params("PINHOLE", int(width), int(height), params, str(path))
+
+
+def _poses_of(path: Path, images: Sequence[Path]) -> list[np.ndarray | None]:
+    found = _poses(path)
+    return [found.get(frame_number(image.name)) for image in images]
 
 
 def _poses(path: Path) -> dict[int, np.ndarray]:

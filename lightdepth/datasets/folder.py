@@ -4,7 +4,8 @@ times.csv has a line `NAME,seconds` for each frame whose time is known, after a 
 that is a frame's name (`frame_00.03s.png`), and this over truth's.
 
 truth/distance/NAME.tiff is float32 [mm] along the ray, 0 where unknown; truth/poses.tum holds world_from_cam, one line
-`time tx ty tz qx qy qz qw` per frame in order, millimetres.
+`time tx ty tz qx qy qz qw` per frame in order, millimetres. Where it has another number of lines, as of a sequence of
+which only some frames are kept, poses and frames meet by time, or by number where times of the frames are not known.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from lightdepth.calibration import read_camera, read_light, write_camera, write_light
 from lightdepth.camera import CameraModel
-from lightdepth.datasets.format import Format, checked_images, frames_of
+from lightdepth.datasets.format import Format, Poses, checked_images, frames_of, poses_or_why
 from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.sequence import (
     FrameSequence,
@@ -68,15 +69,11 @@ def read_folder(
     if mask is None and (path / "mask.png").is_file():
         mask = read_mask(path / "mask.png", first)
     truth = path / "truth"
-    times, poses = read_tum(truth / "poses.tum") if (truth / "poses.tum").is_file() else (None, None)
-    if poses is not None and len(poses) != len(images):
-        raise InputError(
-            f"{truth / 'poses.tum'}", f"{len(poses)} poses for {len(images)} frames", "expected one for each"
-        )
     clock = read_times(path / "times.csv") if (path / "times.csv").is_file() else {}
-    of_truth = [None if times is None else float(times[i]) for i in range(len(images))]
-    named = [WhichFrame.named(image.name).time for image in images]
-    of_name = [known if time is None else time for time, known in zip(named, of_truth, strict=True)]
+    times = _known_times(images, clock)
+    poses: Poses = None
+    if (truth / "poses.tum").is_file():
+        poses = poses_or_why(lambda: _true_poses(truth / "poses.tum", images, times)[0])
 
     def distance(i: int) -> np.ndarray | None:
         file = truth / "distance" / f"{images[i].stem}.tiff"
@@ -88,7 +85,7 @@ def read_folder(
         camera,
         light,
         mask,
-        times=[clock.get(image.stem, time) for image, time in zip(images, of_name, strict=True)],
+        times=times if None not in times else _with_true_times(truth / "poses.tum", images, times),
         poses=poses,
         distance=distance,
         bit_depth=bit_depth,
@@ -97,15 +94,64 @@ def read_folder(
 
 def stamps(path: Path, images: Sequence[Path]) -> tuple[np.ndarray, np.ndarray | None]:
     """Numbers (n,) of a folder's images and their times (n,) [s]; None where these are not known of all."""
-    known = [WhichFrame.named(image.name) for image in images]
+    numbers = np.array([frame_number(image.name) for image in images], np.int64)
     clock = read_times(path / "times.csv") if (path / "times.csv").is_file() else {}
-    of_truth = path / "truth" / "poses.tum"
-    true = read_tum(of_truth)[0].tolist() if of_truth.is_file() else []
-    true = true if len(true) == len(images) else [None] * len(images)
-    named = [t if w.time is None else w.time for w, t in zip(known, true, strict=True)]
-    times = [clock.get(image.stem, time) for image, time in zip(images, named, strict=True)]
-    found = None if any(time is None for time in times) else np.array(times, np.float64)
-    return np.array([w.number for w in known], np.int64), found
+    times = _with_true_times(path / "truth" / "poses.tum", images, _known_times(images, clock))
+    return numbers, None if None in times else np.array(times, np.float64)
+
+
+def _known_times(images: Sequence[Path], clock: Mapping[str, float]) -> list[float | None]:
+    """Times [s] of images, of times.csv or of their names."""
+    return [clock.get(image.stem, WhichFrame.named(image.name).time) for image in images]
+
+
+def _with_true_times(file: Path, images: Sequence[Path], times: list[float | None]) -> list[float | None]:
+    """The times of images [s], those that are not known from the true poses, where these can be read."""
+    if None not in times or not file.is_file():
+        return times
+    try:
+        true = _true_poses(file, images, times)[1]
+    except InputError:
+        return times  # whoever asks for the poses is told
+    return [t if time is None else time for time, t in zip(times, true, strict=True)]
+
+
+def _true_poses(
+    file: Path, images: Sequence[Path], times: Sequence[float | None]
+) -> tuple[list[np.ndarray | None], list[float | None]]:
+    """The pose (4, 4) of each image and its time [s], None for an image that has none. Raises InputError where the file
+    cannot be read, or nothing says whose its poses are."""
+    stamps, poses = read_tum(file)
+    rows = range(len(images)) if len(poses) == len(images) else _rows_of(file, stamps, images, times)
+    return [None if r is None else poses[r] for r in rows], [None if r is None else float(stamps[r]) for r in rows]
+
+
+def _rows_of(
+    file: Path, stamps: np.ndarray, images: Sequence[Path], times: Sequence[float | None]
+) -> Sequence[int | None]:
+    """The line of each image among poses at `stamps` (n,): by time, else by the number in its name, where the stamps
+    are frame numbers, or count evenly from the first frame on."""
+    step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    known = [time for time in times if time is not None]
+    if len(known) == len(times) and step > 0:
+        nearest = [int(np.abs(stamps - time).argmin()) for time in known]
+        near = [abs(stamps[r] - time) <= step / 2 for r, time in zip(nearest, known, strict=True)]
+        if any(near):
+            return [r if ok else None for r, ok in zip(nearest, near, strict=True)]
+    numbers = [frame_number(image.name) for image in images]
+    if (stamps == np.rint(stamps)).all():
+        line = {int(stamp): r for r, stamp in enumerate(stamps)}
+    elif np.abs(stamps - np.arange(len(stamps)) * step).max() < 0.1 * step:
+        line = {r: r for r in range(len(stamps))}
+    else:
+        line = {}
+    if not set(numbers) <= set(line):
+        raise InputError(
+            file,
+            f"{len(stamps)} poses for {len(images)} frames",
+            "expected one for each frame: in order, or at its time (of times.csv or its name), or with its number",
+        )
+    return [line[number] for number in numbers]
 
 
 def _has_camera(path: Path) -> bool:

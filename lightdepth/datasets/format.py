@@ -44,6 +44,18 @@ class Reader(Protocol):
     ) -> FrameSequence: ...
 
 
+Poses = Sequence[np.ndarray | None] | np.ndarray | InputError | None
+"""True poses (4, 4) of images in order; an InputError where those that there are cannot be used."""
+
+
+def poses_or_why(read: Callable[[], Poses]) -> Poses:
+    """What `read` gives, or the InputError that it raises: what needs no truth goes on without it."""
+    try:
+        return read()
+    except InputError as error:
+        return error
+
+
 _NEAREST_MM = 1.0  # no frame shows nothing but wall that is nearer than this
 
 
@@ -112,14 +124,14 @@ def frames_of(
     *,
     names: Sequence[str] | None = None,
     times: Sequence[float | None] | None = None,
-    poses: Sequence[np.ndarray | None] | np.ndarray | None = None,
+    poses: Poses = None,
     distance: Callable[[int], np.ndarray | None] | None = None,
     bit_depth: int | None = None,
     bordered: bool = False,
 ) -> FrameSequence:
     """The images as frames. Names (the files' stems where left out), times [s], poses and what reads the true distance
-    [mm] go by the image's place in the list. Without a mask the black border is found, and said unless the data set is
-    known to have one (`bordered`)."""
+    [mm] go by the image's place in the list; poses that are an InputError are refused with it where the truth is asked
+    for. Without a mask the black border is found, and said unless the data set is known to have one (`bordered`)."""
     called = [image.stem for image in images] if names is None else names
     check_files(images)
     white = white_of(images, bit_depth)
@@ -128,6 +140,13 @@ def frames_of(
         mask = found_mask(images, white)
         if mask is not None and not bordered:
             warn_of_border(path, mask)
+
+    def pose(i: int, with_truth: bool) -> np.ndarray | None:
+        if isinstance(poses, InputError):
+            if with_truth:
+                raise InputError(*poses.args) from poses
+            return None
+        return None if poses is None else poses[i]
 
     def load(i: int, with_truth: bool = True) -> Frame:
         return Frame(
@@ -138,7 +157,7 @@ def frames_of(
             mask,
             time=None if times is None else times[i],
             true_distance=None if distance is None or not with_truth else distance(i),
-            true_world_from_cam=None if poses is None else poses[i],
+            true_world_from_cam=pose(i, with_truth),
         )
 
     return FrameSequence(called, load, str(path), load_blind=partial(load, with_truth=False))

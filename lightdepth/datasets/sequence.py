@@ -32,8 +32,8 @@ class FrameSequence(Sequence[Frame]):
     """Frames by index, each read from disk when it is asked for. `names` and `numbers` cost no reading.
 
     `sampled` are the frames by which the sequence is checked when it is opened: first, middle and last where left out.
-    `load_blind` loads a frame without its true distance, where there may be one; `combs_said` that interlacing was
-    looked for by the reader, who sees more than single frames.
+    `load_blind` loads a frame without its true distance, and without a true pose that cannot be read; `combs_said` that
+    interlacing was looked for by the reader, who sees more than single frames.
     """
 
     def __init__(
@@ -86,7 +86,8 @@ class FrameSequence(Sequence[Frame]):
         return FrameSequence([self.names[i] for i in rows], _Rows(self._load, rows), self.source, load_blind=blind)
 
     def without_truth(self) -> FrameSequence:
-        """The frames without their true distance, which is not read: whatever is wrong with it does not matter."""
+        """The frames without their true distance, which is not read: whatever is wrong with it, or with their true
+        poses, does not matter."""
         if self._load_blind is None:
             return self
         return FrameSequence(self.names, self._load_blind, self.source, self.sampled)

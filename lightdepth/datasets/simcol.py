@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole
-from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
+from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of, poses_or_why
 from lightdepth.datasets.sequence import FrameSequence, numbered_files
 from lightdepth.errors import InputError
 from lightdepth.files.images import image_size, to_bgr8, write_image
@@ -68,13 +68,6 @@ def read_simcol(
         width, height = image_size(images[0])
         # read_camera takes a bare matrix as OpenCV's, with the first centre at (0, 0): undone
         camera = read_camera(file, (width, height)).with_pixel_center(1.0)
-    poses = _read_poses(path)
-    if poses is not None and numbers[-1] >= len(poses):
-        raise InputError(
-            f"{_pose_file(path, _POSITION)}",
-            f"{len(poses)} poses, but there is a frame {numbers[-1]}",
-            "expected a line for each frame, from frame 0",
-        )
     ray_z = camera.rays()[0][..., 2]
     return frames_of(
         path,
@@ -82,7 +75,7 @@ def read_simcol(
         camera,
         light or PhotometricCalibration(),
         mask,
-        poses=None if poses is None else poses[numbers],
+        poses=poses_or_why(lambda: _poses_of(path, numbers)),
         distance=lambda i: _CODE.distance(depth[numbers[i]], ray_z) if numbers[i] in depth else None,
         bit_depth=bit_depth,
     )
@@ -142,6 +135,18 @@ def _beside(path: Path, name: str) -> Path | None:
 
 def _pose_file(path: Path, kind: str) -> Path | None:
     return _beside(path, f"{kind}_{_scene(path)}.txt")
+
+
+def _poses_of(path: Path, numbers: list[int]) -> np.ndarray | None:
+    """(n, 4, 4) world_from_cam [mm] of the frames with these numbers; None where there are no files."""
+    poses = _read_poses(path)
+    if poses is not None and numbers[-1] >= len(poses):
+        raise InputError(
+            f"{_pose_file(path, _POSITION)}",
+            f"{len(poses)} poses, but there is a frame {numbers[-1]}",
+            "expected a line for each frame, from frame 0",
+        )
+    return None if poses is None else poses[numbers]
 
 
 def _read_poses(path: Path) -> np.ndarray | None:
