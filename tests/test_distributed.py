@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -115,3 +117,34 @@ def test_two_machines_of_one_process_each_train_together(tmp_path):
             waiting.kill()  # where the other machine has failed, it waits for it
     assert json.loads((run / "run.json").read_text(encoding="utf-8"))["steps"] == 4
     assert "2 processes, batches of 4 in each." in (run / "model.md").read_text(encoding="utf-8")
+
+
+def children_of(process: int) -> list[int]:
+    return [int(word) for word in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [(signal.SIGKILL, 5, "process 1 of the training (from 0) was ended by SIGKILL"), (signal.SIGTERM, 143, "SIGTERM")],
+)
+def test_where_one_of_two_processes_ends_both_end_in_order_and_can_be_resumed(tmp_path, number, code, said):
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "lightdepth", "train", *TINY_RUN, "-o", str(run)]
+    command += ["--trainer.devices", "2", "--trainer.strategy", "ddp"]
+    with (tmp_path / "said.txt").open("w", encoding="utf-8") as err:
+        first = subprocess.Popen([*command, "--trainer.max_steps", "100000"], stderr=err)
+        try:
+            while not (run / "checkpoints" / "last.ckpt").exists() and first.poll() is None:
+                time.sleep(0.2)
+            (other,) = [k for k in children_of(first.pid) if b"train" in Path(f"/proc/{k}/cmdline").read_bytes()]
+            os.kill(other, number)
+            assert first.wait(120) == code, (tmp_path / "said.txt").read_text(encoding="utf-8")
+        finally:
+            first.kill()
+    assert said in (tmp_path / "said.txt").read_text(encoding="utf-8")
+    assert not Path(f"/proc/{other}").exists()
+    steps = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["global_step"]
+    again = [*command, "--resume", "--trainer.max_steps", str(steps + 4)]
+    assert subprocess.run(again, capture_output=True, timeout=300).returncode == 0
+    assert json.loads((run / "run.json").read_text(encoding="utf-8"))["steps"] == steps + 4
