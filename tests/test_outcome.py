@@ -6,6 +6,7 @@ import ast
 import ctypes
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -314,6 +315,45 @@ def test_bash_completes_verbs_options_choices_and_files(scripts, tmp_path):
 def test_every_shell_offers_the_depth_models_that_come_with_the_program(scripts):
     for shell in SHELLS:
         assert all(name in scripts[shell].read_text() for name in [*bundled(), "decline"])
+
+
+def test_bash_completes_names_of_checkpoints_and_files_with_a_blank(scripts, tmp_path):
+    (tmp_path / "my case").mkdir()
+    (tmp_path / "decided.ckpt").touch()
+    for line, more in (
+        ("densify x --checkpoint de", {"decline"}),
+        ("export de", set()),
+        ("adapt x --checkpoint de", set()),
+    ):
+        assert completed(scripts["bash"], ["lightdepth", *line.split(" ")], tmp_path) == {"decided.ckpt", *more}
+    for words in (["densify", "my c"], ["densify", "x", "--map", "my c"], ["densify", "x", "--checkpoint", "my c"]):
+        assert completed(scripts["bash"], ["lightdepth", *words], tmp_path) == {"my", "case"}  # one line of two words
+
+
+def test_fish_completes_verbs_choices_names_of_checkpoints_and_files(scripts, tmp_path):
+    if shutil.which("fish") is None:
+        pytest.skip("fish is not installed")
+    (tmp_path / "my case").mkdir()
+    (tmp_path / "decided.ckpt").touch()
+    lines = ["den", "synth --layout c", "densify x --checkpoint de", "densify my\\ c", "densify x --map my\\ c"]
+    program = 'source $argv[1]; for line in $argv[2..]; complete -C "lightdepth $line"; echo; end'
+    done = subprocess.run(
+        ["fish", "--no-config", "-c", program, str(scripts["fish"]), *lines],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=tmp_path,
+        env=os.environ | {"HOME": str(tmp_path)},
+    )
+    told = [{one.split("\t")[0] for one in block.splitlines()} for block in done.stdout.split("\n\n")[: len(lines)]]
+    assert told == [{"densify"}, {"c3vd"}, {"decline", "decided.ckpt"}, {"my case/"}, {"my case/"}]
+
+
+def test_what_a_shell_says_of_an_option_ends_with_a_whole_word(scripts):
+    text = scripts["zsh"].read_text(encoding="utf-8")
+    assert "_lightdepth_model_or_file() {" in text
+    said = re.findall(r'^  "--[a-z.-]+\[([^\]]+)\]', text, re.MULTILINE)
+    assert len(said) > 300 and sum(one.endswith(" ...") for one in said) > 30
 
 
 def test_a_tab_starts_no_python(scripts):

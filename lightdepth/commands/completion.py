@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import argparse
 import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
 
+from lightdepth.checkpoint import TRAINING_FREE, bundled
 from lightdepth.command_line.kinds import choices_of_type, leaves, literals
 from lightdepth.command_line.outcome import outcome
 from lightdepth.command_line.presets import presets
@@ -22,8 +24,21 @@ if TYPE_CHECKING:
 
 _NAME_FILES = ("config", "output", "light", "poses", "data.sequences")
 """Options of type text that name a file, or may."""
-_NAME_MODELS = ("checkpoint", "checkpoints", "what", "model.start")
-"""Options that name a depth model: a file, or one that comes with the program."""
+_FUNCTIONS = {
+    "bash": """{name}() {{
+  compgen -f -- "$1"
+  compgen -W "{models}" -- "$1"
+}}""",
+    "zsh": """{name}() {{
+  _alternative 'names:checkpoint:({models})' 'files:file:_files'
+}}""",
+}
+"""A function that completes the name of a checkpoint or a file. With `file` in its name, bash escapes what it gives."""
+_FISH_FILES = "(__fish_complete_path (commandline -ct))"
+_NAME_MODELS = ("checkpoint", "checkpoints")
+"""Options of type text that name a checkpoint, or a model that needs none."""
+_NAME_NETWORKS = ("what", "model.start")
+"""The same, where it must have weights; so must what `adapt` starts from."""
 _PLACES = {
     "bash": "~/.local/share/bash-completion/completions/lightdepth",
     "zsh": "FOLDER/_lightdepth",
@@ -39,7 +54,10 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
     """
     import shtab
 
-    script = shtab.complete(_all_verbs(), shell)
+    function = _FUNCTIONS.get(shell, "")
+    preamble = "\n".join(function.format(name=_name(w), models=" ".join(_models(w))) for w in (False, True))
+    script = shtab.complete(_all_verbs(), shell, preamble=preamble)
+    script = _with_any_file(script, shell)
     place = _PLACES[shell]
     where = f"# Completion of lightdepth for {shell}; it belongs to {place}"
     where += ", where FOLDER is one of $fpath\n" if shell == "zsh" else "\n"
@@ -69,6 +87,34 @@ def _all_verbs() -> argparse.ArgumentParser:
     return root
 
 
+def _models(with_weights: bool) -> list[str]:
+    """The names that an option takes beside the path of a checkpoint."""
+    return [*bundled(), *(() if with_weights else TRAINING_FREE)]
+
+
+def _name(with_weights: bool) -> str:
+    return f"_lightdepth_{'network' if with_weights else 'model'}_or_file"
+
+
+def _model_or_file(with_weights: bool) -> dict[str, str]:
+    """Completes the name of a checkpoint, or a file, in the words of each shell."""
+    name = _name(with_weights)
+    return {"bash": name, "zsh": name, "fish": f"{' '.join(_models(with_weights))} {_FISH_FILES}"}
+
+
+def _with_any_file(script: str, shell: str) -> str:
+    """The script, which also completes files with a blank in their names and, in fish, those below `~`.
+
+    shtab's own completes neither: its bash splits the word at the blank, and its fish takes the word as it was typed.
+    """
+    if shell == "bash":
+        return script.replace("compgen -f -- $1 ", 'compgen -f -- "$1" ')
+    if shell == "fish":
+        script = re.sub(rf'-xka "(.+ ){re.escape(_FISH_FILES)}"', r'-rFka "\1"', script)
+        return script.replace(f'-xka "{_FISH_FILES}"', "-rF").replace(f'-ka "{_FISH_FILES}"', "-F")
+    return script
+
+
 def _add_options(made: argparse.ArgumentParser, parser: Parser, verb: str) -> None:
     import shtab
 
@@ -80,33 +126,13 @@ def _add_options(made: argparse.ArgumentParser, parser: Parser, verb: str) -> No
         elif choices := list(_choices(action, verb)):
             given["choices"] = choices
         if action.dest == "help":
-            words.append("--help-all")
+            made.add_argument("--help-all", action="store_true", help="Show all options, with examples, and exit")
         added = made.add_argument(*(words or [action.dest]), **given)
         kind = getattr(action, "_typehint", None)
-        if added.choices is None and action.dest in _NAME_MODELS:
-            with_weights = verb == "adapt" or action.dest in ("what", "model.start")
-            added.complete = _files_and_models(with_weights)  # type: ignore[attr-defined]  # shtab's way
+        if action.dest in (*_NAME_MODELS, *_NAME_NETWORKS):
+            added.complete = _model_or_file(verb == "adapt" or action.dest in _NAME_NETWORKS)  # type: ignore[attr-defined]  # shtab's way
         elif added.choices is None and (Path in leaves(kind) or action.dest in _NAME_FILES):
-            added.complete = shtab.FILE  # type: ignore[attr-defined]
-
-
-def _files_and_models(with_weights: bool) -> dict[str, Any]:
-    """What completes the name of a depth model, by shell: those that come with the program, of which some have no
-    weights, and files."""
-    import shtab
-
-    from lightdepth.checkpoint import TRAINING_FREE, bundled
-
-    names = " ".join([*bundled(), *(() if with_weights else TRAINING_FREE)])
-    function = f"_lightdepth_files_and_{'networks' if with_weights else 'models'}"
-    bash = f'{function}() {{\n  compgen -f -- "$1"\n  compgen -W \'{names}\' -- "$1"\n}}'
-    zsh = f"{function}() {{\n  _alternative 'models:depth model:({names})' 'files:file:_files'\n}}"
-    return {
-        "bash": function,
-        "zsh": function,
-        "fish": f"{shtab.FILE['fish']} {names}",
-        "preamble": {"bash": bash, "zsh": zsh},
-    }
+            added.complete = shtab.FILE  # type: ignore[attr-defined]  # shtab's way
 
 
 def _choices(action: argparse.Action, verb: str) -> Iterator[str]:
@@ -118,6 +144,6 @@ def _choices(action: argparse.Action, verb: str) -> Iterator[str]:
 
 
 def _plain(text: str) -> str:
-    """The first sentence, without what a shell may take for a command."""
+    """The first sentence, without what a shell may take for a command; a long one ends with a whole word."""
     first = re.split(r"(?<=[.;:])\s", " ".join(text.split()), maxsplit=1)[0].rstrip(".;:")
-    return re.sub(r"[^\w .,;/()+-]", "", first)[:90]
+    return textwrap.shorten(re.sub(r"[^\w .,;/()+-]", "", first), 90, placeholder=" ...")
