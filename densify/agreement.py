@@ -18,9 +18,9 @@ equations, with weights and projections renewed in every round; nothing in it is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated
 
 import cv2
@@ -160,11 +160,12 @@ def agree(
 
 @dataclass(frozen=True)
 class _Rows:
-    """Residuals (n,), their weights (n,) and minus their derivatives (n, m) by the unknowns of each view named."""
+    """Residuals (n,), their weights (n,), and what gives minus their derivatives (n, m) by the unknowns of each view by
+    its place: those of all rows at once are gigabytes for some hundred views."""
 
     residual: np.ndarray
     weight: np.ndarray
-    blocks: dict[int, np.ndarray]
+    blocks: Callable[[], dict[int, np.ndarray]]
 
 
 def _step(
@@ -180,7 +181,7 @@ def _step(
     right = -pull.reshape(views, unknowns)
     for r in rows:
         root = np.sqrt(r.weight)[:, None]  # numpy makes but half of the product of a matrix with its own transpose
-        weighted = {i: of_i * root for i, of_i in r.blocks.items()}
+        weighted = {i: of_i * root for i, of_i in r.blocks().items()}
         for i, of_i in weighted.items():
             right[i] += of_i.T @ (root[:, 0] * r.residual)
             for j, of_j in weighted.items():
@@ -261,7 +262,7 @@ def _residual(view: View, bend: Bend, places: _Places) -> np.ndarray:
 def _point_rows(index: int, view: View, bend: Bend, places: _Places, most: float, config: AgreementConfig) -> _Rows:
     residual = _residual(view, bend, places)
     weight = point_weights(residual, places.growth, places.cells, most, config.shared_error)
-    return _Rows(residual, weight, {index: places.at_points})
+    return _Rows(residual, weight, lambda: {index: places.at_points})
 
 
 def point_weights(
@@ -345,16 +346,22 @@ def _overlap_rows(
             slope = (moved.gap - here.gap) / _STEP
             use = here.known & moved.known & (np.abs(here.gap) < config.max_gap) & (np.abs(slope) < 5)
             if use.sum() >= 10:
-                blocks = {i: -slope[use, None] * phi[use], j: bends[j].basis(here.x[use], here.log_predicted[use])}
-                found.append(_Rows(here.gap[use], np.ones(int(use.sum())), blocks))
+                there = partial(bends[j].basis, here.x[use], here.log_predicted[use])
+                found.append((i, j, here.gap[use], partial(_by_both, i, j, places[i], use, slope[use], there)))
     if not found:
         return []
-    together = _deviation(np.concatenate([f.residual for f in found]))
+    together = _deviation(np.concatenate([gap for _, _, gap, _ in found]))
     weighted = []
-    for f in found:
-        sigma = max(together, *(_deviation(points[i].residual) for i in f.blocks))
-        weighted.append(replace(f, weight=config.overlap * _weight(f.residual / sigma) / sigma**2))
+    for i, j, gap, blocks in found:
+        sigma = max(together, *(_deviation(points[k].residual) for k in (i, j)))
+        weighted.append(_Rows(gap, config.overlap * _weight(gap / sigma) / sigma**2, blocks))
     return weighted
+
+
+def _by_both(
+    i: int, j: int, places: _Places, use: np.ndarray, slope: np.ndarray, there: Callable[[], np.ndarray]
+) -> dict[int, np.ndarray]:
+    return {i: -slope[:, None] * places.grid[2][use], j: there()}
 
 
 @dataclass(frozen=True)
