@@ -37,8 +37,8 @@ _FUNCTIONS = {
 _FISH_FILES = "(__fish_complete_path (commandline -ct))"
 _NAME_MODELS = ("checkpoint", "checkpoints")
 """Options of type text that name a checkpoint, or a model that needs none."""
-_NAME_NETWORKS = ("what", "model.start")
-"""The same, where it must have weights; so must what `adapt` starts from."""
+_NAME_NETWORKS = (("export", "what"), ("adapt", "checkpoint"), ("train", "model.start"))
+"""Verb and option where it must have weights."""
 _PLACES = {
     "bash": "~/.local/share/bash-completion/completions/lightdepth",
     "zsh": "FOLDER/_lightdepth",
@@ -129,8 +129,9 @@ def _add_options(made: argparse.ArgumentParser, parser: Parser, verb: str) -> No
             made.add_argument("--help-all", action="store_true", help="Show all options, with examples, and exit")
         added = made.add_argument(*(words or [action.dest]), **given)
         kind = getattr(action, "_typehint", None)
-        if action.dest in (*_NAME_MODELS, *_NAME_NETWORKS):
-            added.complete = _model_or_file(verb == "adapt" or action.dest in _NAME_NETWORKS)  # type: ignore[attr-defined]  # shtab's way
+        with_weights = (verb, action.dest) in _NAME_NETWORKS
+        if with_weights or action.dest in _NAME_MODELS:
+            added.complete = _model_or_file(with_weights)  # type: ignore[attr-defined]  # shtab's way
         elif added.choices is None and (Path in leaves(kind) or action.dest in _NAME_FILES):
             added.complete = shtab.FILE  # type: ignore[attr-defined]  # shtab's way
 
