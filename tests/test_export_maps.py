@@ -254,11 +254,15 @@ def test_without_its_map_and_frames_a_run_is_still_exported_and_what_is_missing_
     (run / "run.json").write_text(json.dumps({"unit": "mm", "arguments": {"data": str(tmp_path / "gone")}}))
     assert main(["export", str(run), "-o", str(tmp_path / "out"), "--to", "colmap"]) == 0
     said = capsys.readouterr().out
-    assert "no tracks" in said and "frames are not found" in said
+    assert "no tracks: give --map MAP" in said and "frames are not found" in said
     assert "map_000/ has dense/, sparse/: 8 keyframes, " in said and "in mm\nnext: colmap " in said
     assert said.endswith(f"written: {tmp_path / 'out'}\n")
     rebuilt = native.pycolmap().Reconstruction(tmp_path / "out" / "map_000" / "sparse" / "0")
     assert len(rebuilt.images) == 8 and all(p.track.length() == 0 for p in rebuilt.points3D.values())
+    shutil.copytree(run / "map_000", run / "joined_000")
+    assert main(["export", str(run), "-o", str(tmp_path / "joined"), "--to", "colmap"]) == 0
+    assert "joined_000: the map's points have no tracks: they are of several maps" in capsys.readouterr().out
+    shutil.rmtree(run / "joined_000")
     (run / "data").mkdir()
     (run / "data" / "slam").symlink_to(place / "map")  # a demo's run has them inside
     (run / "run.json").write_text(json.dumps({"unit": "mm", "arguments": {"mm_per_unit": MM}}))

@@ -79,7 +79,9 @@ def _write_map(
     if to == "colmap":
         said = write_colmap(exported, folder, frames, points, bar.advance)
         if not exported.tracked:
-            run.warn(f"{exported.name}: the map's points have no tracks: give --map MAP, from which the run was made")
+            several = exported.name.startswith("joined_")
+            why = "they are of several maps" if several else "give --map MAP, from which the run was made"
+            run.warn(f"{exported.name}: the map's points have no tracks: {why}")
     elif to == "nerfstudio":
         said = write_nerfstudio(exported, folder, frames, points, bar.advance)
     elif to == "ply":
