@@ -144,7 +144,7 @@ def frames_of(
     def pose(i: int, with_truth: bool) -> np.ndarray | None:
         if isinstance(poses, InputError):
             if with_truth:
-                raise InputError(*poses.args) from poses
+                raise InputError(poses.where, poses.found, poses.cure) from poses
             return None
         return None if poses is None else poses[i]
 
