@@ -10,6 +10,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -354,6 +355,15 @@ def test_what_a_shell_says_of_an_option_ends_with_a_whole_word(scripts):
     assert "_lightdepth_model_or_file() {" in text
     said = re.findall(r'^  "--[a-z.-]+\[([^\]]+)\]', text, re.MULTILINE)
     assert len(said) > 300 and sum(one.endswith(" ...") for one in said) > 30
+
+
+def test_a_command_that_is_done_does_not_look_through_its_objects_again_before_it_ends():
+    program = (
+        "import atexit, gc\natexit.register(lambda: print('frozen:', gc.get_freeze_count() > 1000))\n"
+        "from lightdepth.cli import main\nmain()"
+    )
+    done = subprocess.run([sys.executable, "-c", program, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("frozen: True\n")
 
 
 def test_a_tab_starts_no_python(scripts):

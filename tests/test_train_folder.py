@@ -23,7 +23,7 @@ from lightdepth.files.writing import PARTIAL, our_mark, write_whole
 from lightdepth.reporting.unfinished import begin
 from lightdepth.signals import Received
 from train.checkpoints import Checkpoints
-from train.commands.train import train
+from train.commands.train import _with_own_config, train
 from train.folder import check_output, training_folder
 from train.running import flushes, while_training
 
@@ -153,3 +153,16 @@ def test_after_a_training_the_process_warns_logs_and_computes_as_before(recwarn)
     assert state() == before and not recwarn.list
     warnings.warn("the loader does not have many workers", stacklevel=1)
     assert len(recwarn.list) == 1
+
+
+def test_a_run_that_was_to_take_the_place_of_another_goes_on_with_its_own_settings(tmp_path):
+    def settings(place: Path) -> Path:
+        place.mkdir()
+        (place / "config.yaml").write_text("seed: 1\n")
+        return place / "config.yaml"
+
+    argv = ["--resume", "-o", str(tmp_path / "run")]
+    of_finished = settings(tmp_path / "run")
+    assert _with_own_config(argv) == ["--config", str(of_finished), *argv]
+    of_other = settings(tmp_path / ".run.unfinished")
+    assert _with_own_config(argv) == ["--config", str(of_other), *argv]

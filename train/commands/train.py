@@ -17,6 +17,7 @@ from lightdepth.command_line.mistakes import fail
 from lightdepth.command_line.outcome import end, outcome
 from lightdepth.command_line.parsing import Parser, parsed
 from lightdepth.command_line.presets import with_preset
+from lightdepth.files.replacing import unfinished_path
 from lightdepth.reporting.names import KEPT
 from lightdepth.reporting.own_settings import with_real_settings
 from lightdepth.reporting.same import paths_in
@@ -66,11 +67,13 @@ def parsers() -> dict[str, Parser]:
 
 
 def _with_own_config(argv: list[str]) -> list[str]:
-    """`--resume` without --preset and --config takes the config.yaml of the run."""
+    """`--resume` without --preset and --config takes the config.yaml of the run that goes on: one that was to take the
+    place of a finished one lies beside it."""
     if "--resume" not in argv or any(a == "--config" or a.startswith("--config=") for a in argv):
         return argv
     for flag, value in pairwise([*argv, ""]):
         folder = flag.partition("=")[2] if flag.startswith("--output=") else value if flag in ("-o", "--output") else ""
-        if folder and (Path(folder) / "config.yaml").is_file():
-            return ["--config", str(Path(folder) / "config.yaml"), *argv]
+        for place in (unfinished_path(Path(folder).resolve()), Path(folder)) if folder else ():
+            if (place / "config.yaml").is_file():
+                return ["--config", str(place / "config.yaml"), *argv]
     return argv
