@@ -21,6 +21,7 @@ import numpy as np
 
 from lightdepth.blocks import submap_folds
 from lightdepth.camera import CameraModel
+from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence
 from lightdepth.datasets.pairing import check_shared_frames
 from lightdepth.decline import BLUR, V_FLOOR, masked_blur
@@ -186,8 +187,8 @@ def fit_on_map(
     if len(drawn) < 4:
         raise InputError(
             sparse_map.source,
-            f"{len(drawn)} keyframes with at least {least} observed points on pixels that are neither black nor "
-            "saturated",
+            f"{counted(len(drawn), 'keyframe')} with at least {least} observed points on pixels that are neither "
+            "black nor saturated",
             "expected at least 4 to find the light from",
         )
     views, samples = [view for view, _ in drawn], [found for _, found in drawn]

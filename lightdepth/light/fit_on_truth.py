@@ -17,6 +17,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence
 from lightdepth.decline import V_FLOOR, masked_blur
 from lightdepth.errors import InputError
@@ -82,7 +83,7 @@ def fit_on_truth(frames: FrameSequence, rng: np.random.Generator | None = None, 
     if len(usable) < 4:
         raise InputError(
             frames.source,
-            f"{len(usable)} frames with known distance on pixels that are neither black nor saturated",
+            f"{counted(len(usable), 'frame')} with known distance on pixels that are neither black nor saturated",
             "expected at least 4. Without depth, give a sparse map: --map MAP",
         )
     fit, judge = usable[::2], usable[1::2]
