@@ -41,6 +41,9 @@ def is_counted() -> bool:
     return bool(_activities)
 
 
+_REASON = " (the first runs on a machine compile loops)"
+
+
 class Heartbeat:
     """Ends silences. `heard` gives when something was said last, `say` takes a line."""
 
@@ -67,7 +70,7 @@ class Heartbeat:
             if self._stage:
                 line += f", {duration(now - self._since)} since: {self._stage}"
             elif not self._begun:
-                line += ", still starting (the first runs on a machine compile loops, once)"
+                line += ", still starting" + ("" if self._own > self._start else _REASON)  # once
         else:
             line = _activities[-1](now)
         if line:
