@@ -18,7 +18,7 @@ equations, with weights and projections renewed in every round; nothing in it is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Annotated
@@ -160,12 +160,27 @@ def agree(
 
 @dataclass(frozen=True)
 class _Rows:
-    """Residuals (n,), their weights (n,), and what gives minus their derivatives (n, m) by the unknowns of each view by
-    its place: those of all rows at once are gigabytes for some hundred views."""
+    """Residuals (n,), their weights (n,) and minus their derivatives (n, m) by the unknowns of each view named."""
 
     residual: np.ndarray
     weight: np.ndarray
-    blocks: Callable[[], dict[int, np.ndarray]]
+    blocks: Mapping[int, np.ndarray]
+
+
+@dataclass(frozen=True)
+class _WhenAsked(Mapping[int, np.ndarray]):
+    """Derivatives that are made each time: those of all pairs of some hundred views are gigabytes."""
+
+    made: dict[int, Callable[[], np.ndarray]]
+
+    def __getitem__(self, view: int) -> np.ndarray:
+        return self.made[view]()
+
+    def __iter__(self) -> Iterator[int]:
+        yield from self.made
+
+    def __len__(self) -> int:
+        return len(self.made)
 
 
 def _step(
@@ -174,14 +189,14 @@ def _step(
     """Solves (J' W J + diag(prior)) step = J' W r - pull; None where it has no solution.
 
     J' W J is built block by block, its lower half alone: views that do not meet have none. A few blocks are solved as
-    one dense matrix, many as a sparse one; with the other views held, each by itself.
+    a dense matrix, many as a sparse one; with the other views held, each by itself.
     """
     unknowns = len(prior) // views
     blocks = {(i, i): np.diag(part) for i, part in enumerate(np.split(prior, views))}
     right = -pull.reshape(views, unknowns)
     for r in rows:
         root = np.sqrt(r.weight)[:, None]  # numpy makes but half of the product of a matrix with its own transpose
-        weighted = {i: of_i * root for i, of_i in r.blocks().items()}
+        weighted = {i: of_i * root for i, of_i in r.blocks.items()}
         for i, of_i in weighted.items():
             right[i] += of_i.T @ (root[:, 0] * r.residual)
             for j, of_j in weighted.items():
@@ -252,6 +267,9 @@ class _Places:
         rays, _ = self.view.keyframe.camera.unproject(x * self.bend.image_size)
         return rays, log_predicted, self.bend.basis(x, log_predicted)
 
+    def sloped(self, slope: np.ndarray, use: np.ndarray) -> np.ndarray:
+        return np.asarray(-slope[:, None] * self.grid[2][use])
+
 
 def _residual(view: View, bend: Bend, places: _Places) -> np.ndarray:
     o = view.observed
@@ -262,7 +280,7 @@ def _residual(view: View, bend: Bend, places: _Places) -> np.ndarray:
 def _point_rows(index: int, view: View, bend: Bend, places: _Places, most: float, config: AgreementConfig) -> _Rows:
     residual = _residual(view, bend, places)
     weight = point_weights(residual, places.growth, places.cells, most, config.shared_error)
-    return _Rows(residual, weight, lambda: {index: places.at_points})
+    return _Rows(residual, weight, {index: places.at_points})
 
 
 def point_weights(
@@ -346,22 +364,15 @@ def _overlap_rows(
             slope = (moved.gap - here.gap) / _STEP
             use = here.known & moved.known & (np.abs(here.gap) < config.max_gap) & (np.abs(slope) < 5)
             if use.sum() >= 10:
-                there = partial(bends[j].basis, here.x[use], here.log_predicted[use])
-                found.append((i, j, here.gap[use], partial(_by_both, i, j, places[i], use, slope[use], there)))
+                own = partial(places[i].sloped, slope[use], use)
+                other = partial(bends[j].basis, here.x[use], here.log_predicted[use])
+                found.append(_Rows(here.gap[use], np.ones(int(use.sum())), _WhenAsked({i: own, j: other})))
     if not found:
         return []
-    together = _deviation(np.concatenate([gap for _, _, gap, _ in found]))
-    weighted = []
-    for i, j, gap, blocks in found:
-        sigma = max(together, *(_deviation(points[k].residual) for k in (i, j)))
-        weighted.append(_Rows(gap, config.overlap * _weight(gap / sigma) / sigma**2, blocks))
-    return weighted
-
-
-def _by_both(
-    i: int, j: int, places: _Places, use: np.ndarray, slope: np.ndarray, there: Callable[[], np.ndarray]
-) -> dict[int, np.ndarray]:
-    return {i: -slope[:, None] * places.grid[2][use], j: there()}
+    together = _deviation(np.concatenate([f.residual for f in found]))
+    sigmas = [max(together, *(_deviation(points[i].residual) for i in f.blocks)) for f in found]
+    weights = [config.overlap * _weight(f.residual / sigma) / sigma**2 for f, sigma in zip(found, sigmas, strict=True)]
+    return [replace(f, weight=weight) for f, weight in zip(found, weights, strict=True)]
 
 
 @dataclass(frozen=True)
