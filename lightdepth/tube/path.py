@@ -17,15 +17,13 @@ from lightdepth.camera import CameraModel, KannalaBrandt, Pinhole
 from lightdepth.datasets.c3vd import C3VD
 from lightdepth.errors import InputError
 from lightdepth.ranges import SHARE, Range, checked, ends_of
-from lightdepth.tube.shape import TubeShape
+from lightdepth.tube.shape import CLOSING, TubeShape
 
 Lens = Literal["pinhole", "telescope", "fisheye", "c3vd"]
 
 
 _FIRST = 8.0, 9.0
 """Where a path begins at the earliest, and at the latest in a tube that is no longer than it, mm."""
-_CLOSING = 0.6
-"""Mean radii over which a tube closes at its end (lightdepth.tube.shape)."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def camera_path(
     """Poses world_from_cam (count, 4, 4) [mm]: `travel` mm along the tube, with sway and looking about. Raises
     InputError where the tube is not as long as that."""
     length, radius = (len(shape.centers) - 1) * shape.step, float(shape.radius.mean())
-    if (longest := length - _FIRST[1] - _CLOSING * radius) < travel:
+    if (longest := length - _FIRST[1] - CLOSING * radius) < travel:
         raise InputError(
             "the endoscope's way",
             f"{travel:g} mm, in a colon of {length:g} mm",

@@ -16,6 +16,9 @@ from scipy.ndimage import gaussian_filter
 from lightdepth.ranges import SHARE, Range, above, at_least, checked, ends_of
 from lightdepth.tube.polyps import Polyp, draw_polyps, raised
 
+CLOSING = 0.6
+"""Mean radii over which a tube closes at its end."""
+
 
 @dataclass(frozen=True)
 @checked
@@ -115,7 +118,7 @@ def make_shape(config: ShapeConfig, rng: np.random.Generator) -> TubeShape:
     relative -= folds
     relative -= fold_rng.uniform(*config.taeniae) * _bands(phi, taenia)
 
-    radius = mean_radius * closed(relative.clip(min=0.3), 0.6 * mean_radius, s, config.length)
+    radius = mean_radius * closed(relative.clip(min=0.3), CLOSING * mean_radius, s, config.length)
     polyps = draw_polyps(radius, config.step, config.polyps, config.polyp_radius, config.stalked, polyp_rng)
     return swept(radius, centers, frames, config.step, polyps)
 

@@ -28,7 +28,7 @@ from lightdepth.photometry import LightTerms, PhotometricCalibration, light_dist
 from lightdepth.tube.scene import Tube, TubeConfig
 from lightdepth.tube.sensor import Sensor, SensorConfig, on_pixels, quantiles
 from lightdepth.tube.sequence import render_sequence
-from lightdepth.tube.shape import ShapeConfig, TubeShape, centreline, closed, swept
+from lightdepth.tube.shape import CLOSING, ShapeConfig, TubeShape, centreline, closed, swept
 from lightdepth.tube.texture import TextureConfig
 
 REFLECTANCE = {"weak": (0.0, 0.2), "strong": (0.5, 0.7)}
@@ -109,7 +109,7 @@ class VariantTube(Tube):
             relative -= arc * profile * np.exp(-((offset / 12) ** 2))
             position += rng.lognormal(np.log(11), 0.45)
         relative = gaussian_filter1d(relative.clip(0.35, 1.5), 1.0, axis=0)
-        return swept(mean * closed(relative, 0.6 * mean, s, length), centers, frames, step)
+        return swept(mean * closed(relative, CLOSING * mean, s, length), centers, frames, step)
 
     @staticmethod
     def _make_texture(
