@@ -14,9 +14,10 @@ unexport PYTHONDONTWRITEBYTECODE
 setup: $(VENV)/.ready
 
 $(VENV)/.ready: pyproject.toml constraints.txt
-	@echo "$(VENV): installing packages (3.6 GB on disk), which takes a few minutes in silence"
+	@echo "$(VENV): fetching packages, then installing them (3.6 GB on disk): a few minutes"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet -c constraints.txt -e ".[dev]"
+	@while sleep 10 > /dev/null 2>&1; do echo "$(VENV): $$(du -sm $(VENV) | cut -f1) of some 3600 MB are installed"; done & beat=$$!; \
+		trap 'kill $$beat' EXIT; $(BIN)/pip install --quiet -c constraints.txt -e ".[dev]"
 	touch $@
 
 demo: setup

@@ -1,4 +1,4 @@
-"""What `make docs` does besides: pages that lie elsewhere in the repository join those of docs/, and links follow."""
+"""What `make docs` does besides: pages from elsewhere and the command line's join those of docs/, and links follow."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ from typing import Any
 
 from mkdocs.structure.files import File
 
+from lightdepth.command_line.reference import reference
+
 ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(\]\()(?![a-z]+:|#)([^)#\s]+)(#[^)\s]*)?\)")
+COMMAND_LINE = "command-line.md"
+"""A page that lies nowhere: it is made from the options themselves."""
 ELSEWHERE = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "data/**/*.md", "lightdepth/weights/*.md")
 
 
@@ -23,7 +27,7 @@ def places() -> dict[str, str]:
         found |= {(name := path.relative_to(ROOT).as_posix()): name for path in sorted(ROOT.glob(pattern))}
     docs = ROOT / "docs"
     found |= {f"docs/{(name := p.relative_to(docs).as_posix())}": name for p in docs.rglob("*.*") if p.suffix != ".py"}
-    return found
+    return found | {f"docs/{COMMAND_LINE}": COMMAND_LINE}
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -31,6 +35,7 @@ def on_files(files: Any, config: Any) -> Any:
     for source, name in places().items():
         if not source.startswith("docs/"):
             files.append(File.generated(config, name, abs_src_path=str(ROOT / source)))
+    files.append(File.generated(config, COMMAND_LINE, content=reference()))
     return files
 
 

@@ -76,8 +76,8 @@ class ModelSource:
 
     checkpoint: str = DEFAULT_CHECKPOINT
     """Depth model: path of a checkpoint (.safetensors or .ckpt), name of a bundled one (lightdepth-both,
-    lightdepth-self or lightdepth-synthetic), decline (a formula for how light fades with distance, no network) or
-    constant (everything equally far, for comparison)."""
+    lightdepth-large, lightdepth-self or lightdepth-synthetic), decline (a formula for how light fades with distance, no
+    network) or constant (everything equally far, for comparison)."""
     device: Device = "auto"
     """What the network runs on: auto, a CUDA GPU where there is one, else the processor; cpu, the processor; cuda; or
     mps, the GPU of an Apple computer. Where the network runs on a CUDA GPU, surfaces are fused there too if NVIDIA Warp

@@ -13,6 +13,8 @@ from scenes import cylinder
 
 from lightdepth.camera import Pinhole
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, ModelSource, bundled, load_model, read_card, save_model
+from lightdepth.command_line.verbs import all_verbs, parsers_of
+from lightdepth.command_line.words import options
 from lightdepth.errors import InputError
 from lightdepth.models import ConstantModel, DeclineModel, NetworkModel
 from lightdepth.module import LightDepth
@@ -103,6 +105,13 @@ def test_every_bundled_checkpoint_loads_and_has_a_card():
         model = load_model(name)
         assert model.name == name and model.rows > 0 and model.card["trained_on"]
         assert (weights / f"{name}.md").read_text().startswith("# ")
+
+
+def test_help_names_every_bundled_checkpoint():
+    for verb, dest in (("densify", "checkpoint"), ("adapt", "checkpoint")):
+        parser = parsers_of(verb, all_verbs()[verb].load())[""]
+        (said,) = (action.help for action in options(parser) if action.dest == dest)
+        assert all(name in said for name in bundled()), verb
 
 
 def test_the_default_checkpoint_is_bundled():

@@ -23,7 +23,7 @@ from lightdepth.tube.export import write_synthetic
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
-TAUGHT = ("video-to-surface", "batch", "millimetres", "training", "evaluation", "measuring", "exporting")
+TAUGHT = ("video-to-surface", "calibrating", "batch", "millimetres", "training", "evaluation", "measuring", "exporting")
 PAGES = "\n".join([*((ROOT / "docs" / f"{name}.md").read_text() for name in TAUGHT), README])
 BLOCKS = re.split(r"^```.*$", PAGES, flags=re.MULTILINE)[1::2]
 LINES = [line for block in BLOCKS for line in block.splitlines() if line.startswith("lightdepth ")]

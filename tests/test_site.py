@@ -23,4 +23,5 @@ def test_the_site_is_built_strictly_and_asks_the_network_for_nothing(tmp_path, m
     written = {path.with_suffix(".html").name for path in (ROOT / "docs").glob("*.md")}
     assert {"index.html", "CHANGELOG.html", "data/index.html", "data/c3vd/index.html"} | written <= set(pages)
     assert [name for name, text in pages.items() if FETCHED.search(text)] == []
+    assert 'id="bench-per-frame"' in pages["command-line.html"] and "--fusion.voxel" in pages["command-line.html"]
     assert 'src="pictures/frames.jpg"' in pages["index.html"] and 'href="training.html"' in pages["index.html"]

@@ -102,8 +102,12 @@ class Parser(ArgumentParser):
         summary, _, tail = tail.partition("\n\n")
         examples = "".join(f"\n  {example}" for example in self.page.examples)
         page = f"{head}{gap}{summary}\n\nexamples:{examples}\n\n{tail}" if examples else page
-        page = _OPTION.sub(lambda found: dashed(found[0]), page)
-        return re.sub(self._names_in_prose(), lambda found: dashed(found[0]), page)
+        return self.with_dashes(page)
+
+    def with_dashes(self, text: str) -> str:
+        """A text in which options are named as they are typed."""
+        text = _OPTION.sub(lambda found: dashed(found[0]), text)
+        return re.sub(self._names_in_prose(), lambda found: dashed(found[0]), text)
 
     def _names_in_prose(self) -> str:
         """A pattern of options as sentences name them, by all of the name or by its last part; no choice is meant."""

@@ -60,7 +60,7 @@ def adapt(
     Args:
         output: Run folder to make, with the adapted model, if it was found better, and a report (report.html).
         checkpoint: Trained model to start from: a path (.safetensors or .ckpt), or the name of a bundled one
-            (lightdepth-both, lightdepth-self or lightdepth-synthetic).
+            (lightdepth-both, lightdepth-large, lightdepth-self or lightdepth-synthetic).
         more: Folders of other sequences of the same endoscope to learn from as well, such as '[A, B]'; they are read
             with the camera, light and mask of DATA. They do not judge.
         map: Sparse map of the frames (a SLAM export or a COLMAP model); its points tell the light where none was given,
