@@ -13,7 +13,7 @@ from lightdepth.light import millimetres as room
 from lightdepth.light.enclosure import Enclosure, enclosure
 from lightdepth.light.looks import Look, Seen, elements, seen_places, typical_distance
 from lightdepth.light.millimetres import Millimetres, millimetres
-from lightdepth.light.shading import _lit, fitted
+from lightdepth.light.shading import Shading, _lit, fitted
 from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
 from lightdepth.tube import render_sequence
 
@@ -107,7 +107,7 @@ def around(looks: list[Look], places: np.ndarray, normals: np.ndarray) -> Enclos
     walls, rng = [look.wall() for look in looks], np.random.default_rng(0)
     typical = typical_distance(looks)
     none = np.zeros((len(looks), len(places)))
-    seen = Seen(places, normals, none[0], none, none)
+    seen = Seen(places, normals, none[0], none, none, 0.0)
     return enclosure(looks, walls, elements(walls, 0.3 * typical), seen, typical, rng)
 
 
@@ -121,6 +121,31 @@ def test_inside_a_sphere_each_element_lights_every_place_by_its_area():
     # Evenly lit, all radiosity is 1 / (1 - rho), whether or not the unseen wall, of which there is none, counts.
     for unseen in (0.0, 1.0):
         np.testing.assert_allclose(found.gathered(0.5, unseen).sum(1), 1, rtol=0.15)
+
+
+def test_of_a_red_wall_s_light_the_brightest_channel_s_less_the_darkest_s_is_reckoned_by_the_reflectance_of_each():
+    out = np.array([[0.0, 0.6, 0.8], [0.0, 0.0, 1.0], [0.6, 0.0, -0.8]] * 4)
+    looks, rho, pale = sphere(6), 0.5, 0.4
+    found = around(looks, 10 * out, -out)
+    # Evenly lit, a channel of reflectance r shows r / (1 - r), of which r is direct light's.
+    shown = pale * (1 - rho) / (1 - pale * rho)
+    none = np.zeros((6, len(out)))
+    seen = Seen(10 * out, -out, none[0], none, none, shown)
+    shading = Shading(np.stack([look.cam_from_map for look in looks]), seen, found, LIGHT)
+    direct, source = np.ones((6, len(out))), np.ones((6, len(found.elements)))
+    way = shading._way(rho, 0.0, direct, source)
+    right = (rho / (1 - rho) - pale * pale * rho / (1 - pale * rho)) / (1 - pale)
+    assert right == pytest.approx(1.5)
+    np.testing.assert_allclose(way.sum(1), right, rtol=0.15)
+    grey = replace(shading, seen=replace(seen, pale=0.0))
+    np.testing.assert_allclose(grey._way(rho, 0.0, direct, source), found.gathered(rho, 0.0))
+
+
+def test_how_pale_the_wall_looks_is_read():
+    colour = np.broadcast_to([0.6, 0.3, 0.2], (96, 120, 3))
+    pair = [faced(10.0 / rays()[..., 2], colour)] * 2
+    seen = seen_places(pair, [look.wall() for look in pair], 2.2, 200, np.random.default_rng(0))
+    assert seen.pale == pytest.approx((0.2 / 0.6) ** 2.2, rel=1e-3)
 
 
 def test_wall_that_no_look_shows_counts_as_much_as_it_is_said_to():
@@ -146,6 +171,26 @@ def test_the_light_s_offset_tells_the_millimetres_of_a_map_unit(looks):
     assert 0 < found.deviation < 0.25 and found.views > 500
     low, high = found.interval
     assert low < 2.0 < high and low * high == pytest.approx(found.mm_per_unit**2)
+
+
+def test_a_search_that_ends_where_its_finer_scales_end_goes_on_from_there(looks, monkeypatch):
+    right = millimetres(looks, LIGHT, near=2.5)
+    monkeypatch.setattr(room, "_profiles", misled := Misled(room._profiles))
+    found = millimetres(looks, LIGHT, near=2.5)
+    assert misled.calls > 2 and not found.refused
+    assert found.mm_per_unit == pytest.approx(right.mm_per_unit, rel=0.05)
+
+
+class Misled:
+    """Profiles of which the first, over coarse scales, has its least three steps too far."""
+
+    def __init__(self, profiles) -> None:
+        self.profiles, self.calls = profiles, 0
+
+    def __call__(self, costs):
+        self.calls += 1
+        found = self.profiles(costs)
+        return found if self.calls > 1 else [np.roll(profile, 3) for profile in found]
 
 
 def test_what_a_board_says_of_the_lens_s_share_of_mu_is_taken_and_the_interval_is_no_wider_for_it():

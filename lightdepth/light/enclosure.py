@@ -41,10 +41,12 @@ class Enclosure:
     between: np.ndarray
     onto: np.ndarray
 
-    def gathered(self, rho: float, unseen: float) -> np.ndarray:
-        """(n, m): times direct light on the elements it is the light that places receive from the wall."""
+    def gathered(self, rho: float, unseen: float, every: int = 1) -> np.ndarray:
+        """(n, m): times direct light on the elements it is the light that places receive from the wall; of places
+        only each of that number in turn, so that 8 is one in eight."""
         share = self.areas / self.areas.sum()
-        between, onto = (k + unseen * (1 - k.sum(1, keepdims=True)) * share for k in (self.between, self.onto))
+        shares = self.between, self.onto[::every]
+        between, onto = (k + unseen * (1 - k.sum(1, keepdims=True)) * share for k in shares)
         result: np.ndarray = rho * np.linalg.solve((np.eye(len(share)) - rho * between).T, onto.T).T
         return result
 

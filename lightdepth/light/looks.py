@@ -6,7 +6,8 @@ edge of a fold above all, the solution leaves something over and the pixel count
 such an edge look like steep wall: with them steep places seemed brighter than any light could make them.
 
 What a wet wall mirrors is as white as the lamp, the wall is not: the brightest channel's light less the darkest's holds
-nothing of it.
+nothing of it. How pale the wall is, the darkest channel's light over the brightest's, says how these two differ in what
+goes from wall to wall.
 """
 
 from __future__ import annotations
@@ -99,13 +100,15 @@ class Wall:
 @dataclass(frozen=True)
 class Seen:
     """Places (n, 3) on the wall with unit normals (n, 3) and by how much looks differ in these (n,), radians; log light
-    (i, n) that each of i looks receives from them, NaN where it does not see them well, and its deviation by noise."""
+    (i, n) that each of i looks receives from them, NaN where it does not see them well, and its deviation by noise; the
+    darkest channel's light over the brightest's in the median."""
 
     places: np.ndarray
     normals: np.ndarray
     turned: np.ndarray
     log_light: np.ndarray
     deviation: np.ndarray
+    pale: float
 
 
 def typical_distance(looks: Sequence[Look]) -> float:
@@ -142,20 +145,23 @@ def seen_places(
         drawn.append(wall.places.reshape(-1, 3)[rng.choice(rows, min(each, len(rows)), replace=False)])
     places = np.concatenate(drawn)
     found = [_read(look, wall, places, gamma, typical) for look, wall in zip(looks, walls, strict=True)]
-    log_light, deviation, weight = (np.stack([f[k] for f in found]) for k in range(3))
-    each_normal = np.stack([f[3] for f in found])
+    log_light, deviation, pale, weight = (np.stack([f[k] for f in found]) for k in range(4))
+    each_normal = np.stack([f[4] for f in found])
     normals = (weight[..., None] * each_normal).sum(0)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     angles = np.arccos(np.clip((each_normal * normals).sum(-1), -1, 1))
     turned = np.sqrt((weight * angles**2).sum(0) / np.maximum(weight.sum(0), 1e-12))
     use = (np.isfinite(log_light).sum(0) >= 2) & (turned < _TURNED)
-    return Seen(places[use], normals[use], turned[use], log_light[:, use], deviation[:, use])
+    told = np.isfinite(log_light) & use
+    paleness = float(np.median(pale[told])) if told.any() else 0.0
+    return Seen(places[use], normals[use], turned[use], log_light[:, use], deviation[:, use], paleness)
 
 
 def _read(
     look: Look, wall: Wall, places: np.ndarray, gamma: float, typical: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Log light (n,) from places in the map, its deviation, how well their normals are known, and these (n, 3)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Log light (n,) from places in the map, its deviation, how pale they are, how well their normals are known, and
+    these (n, 3)."""
     towards = places - look.centre
     reach = np.linalg.norm(towards, axis=1)
     pixels, inside = look.camera.project(places @ look.cam_from_map[:3, :3].T + look.cam_from_map[:3, 3])
@@ -191,7 +197,8 @@ def _read(
     use &= (brightest > _DARK**gamma) & (light > _COLOURED * brightest)
     safe = np.where(use, light, 1)
     log_light = np.where(use, np.log(safe), np.nan)
-    return log_light, np.sqrt(variance) / safe, use * cosine**2 / reach**2, normals
+    pale = 1 - safe / np.where(use, brightest, 1)
+    return log_light, np.sqrt(variance) / safe, pale, use * cosine**2 / reach**2, normals
 
 
 def _mean(values: np.ndarray) -> np.ndarray:

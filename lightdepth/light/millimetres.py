@@ -41,8 +41,9 @@ __all__ = ["Look", "Millimetres", "Together", "millimetres", "together"]
 
 _RANGE, _STEPS = (0.4, 2.5), 13  # of the scale about the one that is expected
 _COARSE = ((0.0, 0.1, 0.3, 0.6), (0.5,))  # reflectances, and shares of the unseen wall
-_FINE = ((0.0, 0.04, 0.08, 0.15, 0.25, 0.4, 0.55, 0.7), (0.0, 0.5, 1.0))
+_FINE = ((0.0, 0.04, 0.08, 0.15, 0.25, 0.33, 0.4, 0.48, 0.55, 0.62, 0.7), (0.0, 0.5, 1.0))
 _FINE_STEPS = 9  # of the scale, over two steps of the coarse ones to either side
+_MOVED = 2  # times that these are moved to where their best is, if that is their end
 _CELL = 0.18  # side of the elements of wall that light each other, as a share of the typical distance
 _PLACES = 2600
 _BLOCK = 0.5  # side of the blocks of wall that are drawn together, as a share of the typical distance
@@ -201,10 +202,16 @@ def _solved(
     at = [int(profile.argmin()) for profile in coarse]
     stretch = (ranges[0][1] / ranges[0][0]) ** np.linspace(-2, 2, _FINE_STEPS)
     scales = [r[i] * stretch for r, i in zip(ranges, at, strict=True)]
-    losses = [
-        p.shading.losses(s, *_FINE, blocks=_blocks(p.shading.seen.places, _BLOCK * p.typical))
-        for p, s in zip(placed, scales, strict=True)
-    ]
+    blocks = [_blocks(p.shading.seen.places, _BLOCK * p.typical) for p in placed]
+    losses = [p.shading.losses(s, *_FINE, blocks=b) for p, s, b in zip(placed, scales, blocks, strict=True)]
+    for _ in range(_MOVED):
+        steps = [int(profile.argmin()) for profile in _profiles([loss.sum((3, 4)) for loss in losses])]
+        rows = [k for k, step in enumerate(steps) if _inside(scales[k], step, ranges[k])]
+        if not rows:
+            break
+        for k in rows:
+            scales[k] = scales[k][steps[k]] * stretch
+            losses[k] = placed[k].shading.losses(scales[k], *_FINE, blocks=blocks[k])
     draws = np.log(_drawn(losses, scales, rng))
     found = np.exp(np.median(draws, axis=0))
     costs = [loss.sum((3, 4)) for loss in losses]
@@ -223,6 +230,11 @@ def _solved(
         share = offset / ((near[k] if flat else one.mm_per_unit) * p.typical)
         told.append(replace(one, refused=_doubt(one, flat, share)))
     return told, covariance
+
+
+def _inside(scales: np.ndarray, step: int, bounds: np.ndarray) -> bool:
+    """Whether the best of the scales is their first or last, and not yet an end of what is searched."""
+    return step in (0, len(scales) - 1) and bool(bounds[0] < scales[step] < bounds[-1])
 
 
 def _doubt(told: Millimetres, flat: bool, share: float) -> str:

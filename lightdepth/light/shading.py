@@ -18,6 +18,7 @@ from lightdepth.photometry import PhotometricCalibration, irradiance
 _FLOOR, _TILT = 0.01, 0.015  # deviation of log light, and of normals [rad]
 _OUT = 2.5  # deviations at which a view counts for a quarter
 _ABSOLUTE, _ROUNDS = 4, 5
+_PALER, _SOME, _PALEST = 3, 8, 0.9  # rounds in which the wall's own paleness is found, by each such place
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class Shading:
         known, deviation = self._deviation()
         blocks = np.zeros(known.shape[1], int) if blocks is None else blocks
         total = np.zeros((len(scales), len(rhos), len(shares), len(known), int(blocks.max()) + 1))
-        ways = {(j, k): self.around.gathered(r, b) for j, r in enumerate(rhos) for k, b in enumerate(shares) if r}
+        lit = self._direct(float(scales[len(scales) // 2]))
+        ways = {(j, k): self._way(r, b, *lit) for j, r in enumerate(rhos) for k, b in enumerate(shares) if r}
         for i, scale in enumerate(scales):
             direct, source = self._direct(float(scale))
             for j, rho in enumerate(rhos):
@@ -63,7 +65,7 @@ class Shading:
         logs = []
         for shading in (self, turned):
             direct, source = shading._direct(scale)
-            received = direct + (self.around.gathered(rho, unseen) @ source.T).T if rho else direct
+            received = direct + (self._way(rho, unseen, direct, source) @ source.T).T if rho else direct
             logs.append(np.log(np.maximum(received, 1e-12)))
         left = self._left(np.exp(logs[0]), known)
         _, (aside, bent) = fitted(left, known, deviation, [(logs[1] - logs[0]) / 0.1, logs[0]])
@@ -84,6 +86,23 @@ class Shading:
         onto = [_lit(self.seen.places, self.seen.normals, pose, self.light, scale, self.lens) for pose in self.poses]
         between = [_lit(wall.elements, wall.normals, pose, self.light, scale, self.lens) for pose in self.poses]
         return np.stack(onto), np.stack(between) * wall.lit
+
+    def _way(self, rho: float, unseen: float, direct: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """(n, m): times direct light on the elements it is what the wall adds to a place's light, brightest channel's
+        less darkest's, in units of what direct light adds there. `direct` (i, n) and `source` (i, m) tell how pale the
+        wall itself is: light from wall to wall makes it look less so."""
+        known, pale = np.isfinite(self.seen.log_light)[:, ::_SOME], self.seen.pale
+
+        def received(reflectance: float) -> np.ndarray:
+            way = self.around.gathered(reflectance, unseen, _SOME)
+            return (direct[:, ::_SOME] + (way @ source.T).T)[known]
+
+        for _ in range(_PALER):
+            shown = float(np.median(received(rho) / received(pale * rho)))
+            pale = min(self.seen.pale * shown, _PALEST)
+        bright, dark = self.around.gathered(rho, unseen), self.around.gathered(pale * rho, unseen)
+        result: np.ndarray = (bright - pale * dark) / (1 - pale)
+        return result
 
     def _left(self, received: np.ndarray, known: np.ndarray) -> np.ndarray:
         """log L - log E (i, n), 0 where unknown."""

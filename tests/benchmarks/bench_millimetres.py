@@ -4,8 +4,9 @@
 
 Colons of seeds that nothing was tuned on, of two renderers that share no line: lightdepth.tube (a pinhole and a
 fisheye in turn, one lamp 8 to 15 % of 33 mm beside the lens) and lightdepth.judge_colons (five lenses, four gammas,
-one lamp or two at one side of the lens, a wet film, vignetting, paths traced). Twelve frames each; the wall throws back
-little (up to .1) or much (.2 to .6). Of each: the scale found (right: 1), its 90 % interval, and reflectance.
+one lamp or two at one side of the lens, a wet film, vignetting, paths traced). Twelve frames each, of 320x256 pixels of
+the tube and of some 160x128 of the other; the wall throws back little (up to .1) or much (.2 to .6). Of each: the scale
+found (right: 1), its 90 % interval, and reflectance.
 LIGHTDEPTH_MILLIMETRES=FILE writes the tables.
 """
 
@@ -30,14 +31,16 @@ from lightdepth.light.millimetres import Look, Millimetres, millimetres
 from lightdepth.photometry import PhotometricCalibration
 from lightdepth.tube import render_sequence
 
-LENSES = (
+ENLARGED = int(os.environ.get("LIGHTDEPTH_ENLARGED", "2"))  # times 160x128, of the tube
+BASES = (
     Pinhole(160, 128, 86.0, 86.0, 80.0, 64.0),
     KannalaBrandt(160, 128, 70.0, 70.0, 80.0, 64.0, 0.02, -0.01, 0.0, 0.0),
 )
+LENSES = tuple(base.resized(160 * ENLARGED, 128 * ENLARGED) for base in BASES)
 KINDS: tuple[LensKind, ...] = ("plain", "fisheye", "barrel", "narrow", "circle")
 EXPOSURES: tuple[Exposure, ...] = ("even", "even", "dark")
-FIRST, COUNT = int(os.environ.get("LIGHTDEPTH_FIRST_SEED", "7640")), int(os.environ.get("LIGHTDEPTH_COUNT", "12"))
-OTHER_FIRST = int(os.environ.get("LIGHTDEPTH_FIRST_OTHER_SEED", "77100"))
+FIRST, COUNT = int(os.environ.get("LIGHTDEPTH_FIRST_SEED", "7692")), int(os.environ.get("LIGHTDEPTH_COUNT", "12"))
+OTHER_FIRST = int(os.environ.get("LIGHTDEPTH_FIRST_OTHER_SEED", "77150"))
 OTHER_COUNT = int(os.environ.get("LIGHTDEPTH_OTHER_COUNT", "8"))
 Colon = tuple[list[Look], PhotometricCalibration, float]
 
