@@ -111,6 +111,11 @@ def around(looks: list[Look], places: np.ndarray, normals: np.ndarray) -> Enclos
     return enclosure(looks, walls, elements(walls, 0.3 * typical), seen, typical, rng)
 
 
+def evenly(found: Enclosure) -> np.ndarray:
+    """Direct light of 1 on every element."""
+    return np.ones((1, len(found.elements)))
+
+
 def test_inside_a_sphere_each_element_lights_every_place_by_its_area():
     out = np.array([[0.0, 0.6, 0.8], [0.0, 0.0, 1.0], [0.6, 0.0, -0.8]])
     found = around(sphere(6), 10 * out, -out)
@@ -120,7 +125,7 @@ def test_inside_a_sphere_each_element_lights_every_place_by_its_area():
     np.testing.assert_allclose(found.onto[:, octant].sum(1), 1 / 8, atol=0.06)
     # Evenly lit, all radiosity is 1 / (1 - rho), whether or not the unseen wall, of which there is none, counts.
     for unseen in (0.0, 1.0):
-        np.testing.assert_allclose(found.gathered(0.5, unseen).sum(1), 1, rtol=0.15)
+        np.testing.assert_allclose(found.received(0.5, unseen, evenly(found)), 1, rtol=0.15)
 
 
 def test_of_a_red_wall_s_light_the_brightest_channel_s_less_the_darkest_s_is_reckoned_by_the_reflectance_of_each():
@@ -133,12 +138,12 @@ def test_of_a_red_wall_s_light_the_brightest_channel_s_less_the_darkest_s_is_rec
     seen = Seen(10 * out, -out, none[0], none, none, shown)
     shading = Shading(np.stack([look.cam_from_map for look in looks]), seen, found, LIGHT)
     direct, source = np.ones((6, len(out))), np.ones((6, len(found.elements)))
-    way = shading._way(rho, 0.0, direct, source)
+    assert shading._pale(rho, 0.0, direct, source) == pytest.approx(pale, rel=0.1)
     right = (rho / (1 - rho) - pale * pale * rho / (1 - pale * rho)) / (1 - pale)
     assert right == pytest.approx(1.5)
-    np.testing.assert_allclose(way.sum(1), right, rtol=0.15)
-    grey = replace(shading, seen=replace(seen, pale=0.0))
-    np.testing.assert_allclose(grey._way(rho, 0.0, direct, source), found.gathered(rho, 0.0))
+    np.testing.assert_allclose(shading._from_wall(rho, 0.0, pale, source[None]), right, rtol=0.15)
+    as_grey = shading._from_wall(rho, 0.0, 0.0, source[None])[0]
+    np.testing.assert_allclose(as_grey, found.received(rho, 0.0, source))
 
 
 def test_how_pale_the_wall_looks_is_read():
@@ -151,7 +156,7 @@ def test_how_pale_the_wall_looks_is_read():
 def test_wall_that_no_look_shows_counts_as_much_as_it_is_said_to():
     out = np.array([[0.0, 0.0, 1.0], [0.0, 0.6, 0.8]])
     found = around(sphere(1), 10 * out, -out)
-    open_, half, closed = (found.gathered(0.5, unseen).sum(1) for unseen in (0.0, 0.5, 1.0))
+    open_, half, closed = (found.received(0.5, unseen, evenly(found)) for unseen in (0.0, 0.5, 1.0))
     assert (open_ < 0.35).all() and (open_ < half).all() and (half < closed).all()
     np.testing.assert_allclose(closed, 1, rtol=1e-6)
 

@@ -41,13 +41,13 @@ class Enclosure:
     between: np.ndarray
     onto: np.ndarray
 
-    def gathered(self, rho: float, unseen: float, every: int = 1) -> np.ndarray:
-        """(n, m): times direct light on the elements it is the light that places receive from the wall; of places
-        only each of that number in turn, so that 8 is one in eight."""
+    def received(self, rho: float, unseen: float, direct: np.ndarray, every: int = 1) -> np.ndarray:
+        """Light (k, n) that places receive from the wall under each of k lights, of which direct light (k, m) reaches
+        the elements; of places only each of that number in turn, so that 8 is one in eight."""
         share = self.areas / self.areas.sum()
         shares = self.between, self.onto[::every]
         between, onto = (k + unseen * (1 - k.sum(1, keepdims=True)) * share for k in shares)
-        result: np.ndarray = rho * np.linalg.solve((np.eye(len(share)) - rho * between).T, onto.T).T
+        result: np.ndarray = rho * (onto @ np.linalg.solve(np.eye(len(share)) - rho * between, direct.T)).T
         return result
 
 

@@ -40,17 +40,17 @@ class Shading:
         known, deviation = self._deviation()
         blocks = np.zeros(known.shape[1], int) if blocks is None else blocks
         total = np.zeros((len(scales), len(rhos), len(shares), len(known), int(blocks.max()) + 1))
-        lit = self._direct(float(scales[len(scales) // 2]))
-        ways = {(j, k): self._way(r, b, *lit) for j, r in enumerate(rhos) for k, b in enumerate(shares) if r}
-        for i, scale in enumerate(scales):
-            direct, source = self._direct(float(scale))
-            for j, rho in enumerate(rhos):
-                for k in range(len(shares)):
-                    if not rho and k:
-                        total[i, j, k] = total[i, j, 0]
-                        continue
-                    received = direct + (ways[j, k] @ source.T).T if rho else direct
-                    residual = fitted(self._left(received, known), known, deviation)[0]
+        direct, source = (np.stack(lit) for lit in zip(*(self._direct(float(s)) for s in scales), strict=True))
+        middle = len(scales) // 2
+        for j, rho in enumerate(rhos):
+            pale = self._pale(rho, shares[len(shares) // 2], direct[middle], source[middle])
+            for k, unseen in enumerate(shares):
+                if not rho and k:
+                    total[:, j, k] = total[:, j, 0]
+                    continue
+                received = direct + self._from_wall(rho, unseen, pale, source)
+                for i in range(len(scales)):
+                    residual = fitted(self._left(received[i], known), known, deviation)[0]
                     squared = (residual / _OUT) ** 2
                     loss = known * squared / (1 + squared)
                     for look, row in enumerate(loss):
@@ -65,7 +65,7 @@ class Shading:
         logs = []
         for shading in (self, turned):
             direct, source = shading._direct(scale)
-            received = direct + (self._way(rho, unseen, direct, source) @ source.T).T if rho else direct
+            received = direct + self._from_wall(rho, unseen, self._pale(rho, unseen, direct, source), source[None])[0]
             logs.append(np.log(np.maximum(received, 1e-12)))
         left = self._left(np.exp(logs[0]), known)
         _, (aside, bent) = fitted(left, known, deviation, [(logs[1] - logs[0]) / 0.1, logs[0]])
@@ -87,21 +87,29 @@ class Shading:
         between = [_lit(wall.elements, wall.normals, pose, self.light, scale, self.lens) for pose in self.poses]
         return np.stack(onto), np.stack(between) * wall.lit
 
-    def _way(self, rho: float, unseen: float, direct: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """(n, m): times direct light on the elements it is what the wall adds to a place's light, brightest channel's
-        less darkest's, in units of what direct light adds there. `direct` (i, n) and `source` (i, m) tell how pale the
-        wall itself is: light from wall to wall makes it look less so."""
+    def _pale(self, rho: float, unseen: float, direct: np.ndarray, source: np.ndarray) -> float:
+        """How pale the wall itself is under direct light on places (i, n) and elements (i, m): light from wall to wall
+        makes it look less so."""
         known, pale = np.isfinite(self.seen.log_light)[:, ::_SOME], self.seen.pale
+        if not rho:
+            return pale
 
-        def received(reflectance: float) -> np.ndarray:
-            way = self.around.gathered(reflectance, unseen, _SOME)
-            return (direct[:, ::_SOME] + (way @ source.T).T)[known]
+        def of_channel(reflectance: float) -> np.ndarray:
+            return (direct[:, ::_SOME] + self.around.received(reflectance, unseen, source, _SOME))[known]
 
+        bright = of_channel(rho)
         for _ in range(_PALER):
-            shown = float(np.median(received(rho) / received(pale * rho)))
-            pale = min(self.seen.pale * shown, _PALEST)
-        bright, dark = self.around.gathered(rho, unseen), self.around.gathered(pale * rho, unseen)
-        result: np.ndarray = (bright - pale * dark) / (1 - pale)
+            pale = min(self.seen.pale * float(np.median(bright / of_channel(pale * rho))), _PALEST)
+        return pale
+
+    def _from_wall(self, rho: float, unseen: float, pale: float, source: np.ndarray) -> np.ndarray:
+        """What the wall adds (k, i, n) to the light of places, the brightest channel's less the darkest's, in units of
+        what direct light adds there, where direct light on the elements is (k, i, m)."""
+        if not rho:
+            return np.zeros((*source.shape[:2], len(self.seen.places)))
+        flat = source.reshape(-1, source.shape[2])
+        bright, dark = (self.around.received(reflectance, unseen, flat) for reflectance in (rho, pale * rho))
+        result: np.ndarray = ((bright - pale * dark) / (1 - pale)).reshape(*source.shape[:2], -1)
         return result
 
     def _left(self, received: np.ndarray, known: np.ndarray) -> np.ndarray:
