@@ -95,7 +95,8 @@ class Shading:
             return pale
 
         def of_channel(reflectance: float) -> np.ndarray:
-            return (direct[:, ::_SOME] + self.around.received(reflectance, unseen, source, _SOME))[known]
+            light: np.ndarray = (direct[:, ::_SOME] + self.around.received(reflectance, unseen, source, _SOME))[known]
+            return light
 
         bright = of_channel(rho)
         for _ in range(_PALER):
