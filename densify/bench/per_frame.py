@@ -147,7 +147,7 @@ def _means(rows: Sequence[ColonFigures], strong: bool) -> Table:
     bounce = f"strong bounce (reflectance above {STRONG:g})" if strong else f"weak bounce (up to {STRONG:g})"
     bars = ", ".join(f"{title} {BARS[name]:g}" for name, title in ERRORS.items())
     return Table(
-        f"{bounce}, {len(base)} colons, mean over colons; {UNIT}. Ratios are of the means, to the closed form's; then "
+        f"{bounce}: {len(base)} colons, mean over colons; {UNIT}. Ratios are of the means, to the closed form's; then "
         f"on how many colons the ratio is below 1, and at most the bar ({bars})",
         ["model", *titles, "judged share"],
         found,
@@ -177,7 +177,7 @@ def _intervals(rows: Sequence[ColonFigures], models: Sequence[str]) -> list[Tabl
             if stated:
                 found.append([model, bounce, *(f"{100 * share:.0f} %" for share in np.mean(stated, 0))])
     headers = ["model", "bounce", *(f"{100 * level:.0f} %" for level in LEVELS)]
-    title = "share of pixels inside the stated intervals, mean over colons, each frame's median scale taken out"
+    title = "share of pixels inside the stated intervals: mean over colons, each frame's median scale taken out"
     return [Table(title, headers, found)] if found else []
 
 
