@@ -266,6 +266,14 @@ def test_a_wall_as_bright_as_any_that_is_tried_is_refused():
     assert room._doubt(Millimetres(1.0, 0.1, 0.3, 999, "", 0.0, 0.0), False, 0.1) == why
 
 
+def test_a_wall_that_may_be_another_response_is_refused_unless_the_response_was_measured(monkeypatch):
+    monkeypatch.setattr(room, "_FINE", ((0.0, 0.4, 0.7), (0.5,)))
+    bright, as_any = (Millimetres(1.0, 0.1, rho, 999, "", 0.0, 0.0) for rho in (0.4, 0.7))
+    assert room._doubt(bright, False, 0.1).startswith("a wall of reflectance 0.4 or more, or another response")
+    assert room._doubt(bright, False, 0.1, measured=True) == ""
+    assert room._doubt(as_any, False, 0.1, measured=True).startswith("a wall of reflectance 0.7 or more")
+
+
 def test_a_cost_that_is_flat_is_refused_and_one_that_is_not_is_told():
     told = Millimetres(1.0, 0.1, 0.1, 999, "", 0.0, 0.0)
     flat = "shading hardly changes with the scale: the light's offset is 10.0% of the distance"

@@ -60,13 +60,14 @@ _CURES = (
     ("views of places", "use frames that are neither clipped nor dark, and keyframes that see the same wall"),
     ("shines from elsewhere", "check position_mm in light.json: is it this endoscope's, in camera axes?"),
     ("response does not fit", "check gamma in light.json: is it that of this recording?"),
-    ("a wall of reflectance", "check gamma in light.json, or give a known length"),
+    ("a wall of reflectance", "measure the light on a board (calibrate-light --position), or give a known length"),
     ("shading hardly changes", "say how far the wall is, or give a known length"),
     ("offset is", "go nearer to the wall, or give a known length"),
     ("contradicts the known length", "measure the length again, or check light.json"),
 )
 """What to do about each refusal, by words in it."""
 _ASIDE, _BENT = 0.25, 0.2  # tangent of the angle to where the images put the light; error of the response's exponent
+_UNMEASURED = 0.4  # reflectance from which a wall looks as one under another response: gamma 1, where it is 2.2
 _LEAST_VIEWS, _LEAST_LOOKS = 300, 3
 
 
@@ -228,7 +229,8 @@ def _solved(
         one = Millimetres(float(found[k]), float(np.sqrt(covariance[k, k])), reflectance, p.views, "", *doubts)
         flat = at[k] in (0, _STEPS - 1) or steps[k] in (0, _FINE_STEPS - 1) or one.deviation > _WIDEST
         share = offset / ((near[k] if flat else one.mm_per_unit) * p.typical)
-        told.append(replace(one, refused=_doubt(one, flat, share)))
+        measured = p.shading.light.lamps is not None
+        told.append(replace(one, refused=_doubt(one, flat, share, measured)))
     return told, covariance
 
 
@@ -237,8 +239,10 @@ def _inside(scales: np.ndarray, step: int, bounds: np.ndarray) -> bool:
     return step in (0, len(scales) - 1) and bool(bounds[0] < scales[step] < bounds[-1])
 
 
-def _doubt(told: Millimetres, flat: bool, share: float) -> str:
-    """Why no figure is given, of a light beside the lens by such a share of the distance; empty where nothing is."""
+def _doubt(told: Millimetres, flat: bool, share: float, measured: bool = False) -> str:
+    """Why no figure is given, of a light beside the lens by such a share of the distance, measured on a board or not;
+    empty where nothing is."""
+    brightest = _FINE[0][-1] if measured else min(_UNMEASURED, _FINE[0][-1])
     if share < _NEAREST:
         return f"the light's offset is {share:.1%} of the distance, of {_NEAREST:.0%} needed"
     if abs(told.aside) > _ASIDE:
@@ -246,7 +250,7 @@ def _doubt(told: Millimetres, flat: bool, share: float) -> str:
         return f"the light shines from elsewhere: the images put it {angle:.0f} degrees around the axis from its place"
     if abs(told.bent) > _BENT:
         return f"the response does not fit: the images' gamma is {1 / (1 + told.bent):.2f} times the light's"
-    if told.reflectance >= _FINE[0][-1]:
+    if told.reflectance >= brightest:
         return f"a wall of reflectance {told.reflectance:g} or more, or another response: the images do not say which"
     if flat:
         return f"shading hardly changes with the scale: the light's offset is {share:.1%} of the distance"
