@@ -1,4 +1,4 @@
-"""The command line as a page of the documentation: every verb with all its options, from the parsers themselves."""
+"""The command line as a page of the documentation: every verb with all its options, taken from the parsers."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from lightdepth.counting import counted
 
 _BEGINNING = """# Command line
 
-Every verb with all its options, as `--help-all` shows them. Those of a group have a dot in their name, as in
-`--fusion.voxel`. Every verb takes these besides:
+Every verb with all its options, as `--help-all` shows them. Options of a group have a dot in their name, as in
+`--fusion.voxel`. Every verb also takes these:
 
 - `--help`: the everyday options, with examples; `--help-all`: all of them.
-- `--config FILE`: a YAML file with any of the options; those on the command line win.
+- `--config FILE`: a YAML file with any of the options; those on the command line take precedence.
 - `--print-config`: prints such a file with all settings.
 - `--quiet`: only errors, warnings, and what was written where.
 - `--json`: the result as one JSON document.
@@ -28,7 +28,7 @@ _CODE = re.compile(r"`([^`]+)`")
 
 
 def reference() -> str:
-    """Markdown, a heading for each verb and for each other way of one."""
+    """Markdown with a heading for each verb, and for each other way to call one."""
     parts = [_BEGINNING]
     for verb, entry in all_verbs().items():
         for way, parser in parsers_of(verb, entry.load()).items():
@@ -54,7 +54,7 @@ def _of_verb(parser: Parser) -> Iterator[str]:
 def _rows(parser: Parser, shown: list[argparse.Action]) -> str:
     formatter, rows = parser._get_formatter(), []
     for action in shown:
-        # argparse's own, as jsonargparse's wants to know which parser is being printed
+        # argparse's own method: that of jsonargparse needs to know which parser is being printed
         typed = argparse.HelpFormatter._format_action_invocation(formatter, action)
         said = formatter._expand_help(action) if action.help else ""
         name = typed if action.option_strings else action.dest.upper()
