@@ -64,8 +64,8 @@ def check_output(output: Path, resume: bool, overwrite: bool, inputs: Iterable[P
         _is_begun(unfinished_path(output.resolve())),
     )
     if not resume and not overwrite and (complete or has_checkpoint(output) or hidden):
-        state = "complete" if complete and not hidden else "unfinished"
-        raise InputError(output, f"holds a {state} run", "--resume continues it, --overwrite starts anew")
+        state = "a complete" if complete and not hidden else "an unfinished"
+        raise InputError(output, f"holds {state} run", "--resume continues it, --overwrite starts anew")
     if resume and complete:
         _check_resumable(output, begun, hidden)
     if overwrite:

@@ -51,8 +51,8 @@ PAGES = {
     "calibrate-light": Page(
         (
             "lightdepth calibrate-light data/mine --map runs/slam -o light.json",
-            "lightdepth calibrate-light frames --position charuco --board.squares [9,7] --board.square-mm 4 "
-            "--board.marker-mm 3 -o light.json",
+            "lightdepth calibrate-light board --camera camera.json --position charuco --board.squares [9,7] "
+            "--board.square-mm 4 --board.marker-mm 3 -o light.json",
         ),
         more=("board.squares", "board.square_mm", "board.marker_mm", "board.dictionary"),
     ),

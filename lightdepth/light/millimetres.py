@@ -13,10 +13,12 @@ views i of places m, with L the light that comes back (lightdepth.light.looks),
 
     log L_im = log g_i + log a_m + log E_im(s, rho, b) + noise,
 
-gain g_i and albedo a_m unknown. For each s, rho and b of a grid these are fitted robustly, from a fit by absolute
-values: gains differ by much between frames, and a redescending loss alone settles on a part of them. What is left over,
-as a function of s, is least at the right scale; where the offset is too small to be seen it is flat, and nothing is
-said. Blocks of wall and looks are drawn anew, and the least cost found again over s, rho and b: that is the interval.
+gain g_i and albedo a_m unknown. L is the brightest channel's light less the darkest's, and E_ind is reckoned for both,
+each with its own reflectance (lightdepth.light.shading). For each s, rho and b of a grid these are fitted robustly,
+from a fit by absolute values: gains differ by much between frames, and a redescending loss alone settles on a part of
+them. What is left over, as a function of s, is least at the right scale; where the offset is too small to be seen it is
+flat, and nothing is said. Blocks of wall and looks are drawn anew, and the least cost found again over s, rho and b:
+that is the interval.
 Maps of one procedure have one rho and one b: their costs are added, and each has its s.
 
 A part of a light file's mu is the lens's (vignetting, about the camera's axis) and does not move with P. A light that
@@ -206,8 +208,8 @@ def _solved(
     blocks = [_blocks(p.shading.seen.places, _BLOCK * p.typical) for p in placed]
     losses = [p.shading.losses(s, *_FINE, blocks=b) for p, s, b in zip(placed, scales, blocks, strict=True)]
     for _ in range(_MOVED):
-        steps = [int(profile.argmin()) for profile in _profiles([loss.sum((3, 4)) for loss in losses])]
-        rows = [k for k, step in enumerate(steps) if _inside(scales[k], step, ranges[k])]
+        steps = _steps(losses)
+        rows = [k for k, step in enumerate(steps) if _goes_on(scales[k], step, ranges[k])]
         if not rows:
             break
         for k in rows:
@@ -216,7 +218,7 @@ def _solved(
     draws = np.log(_drawn(losses, scales, rng))
     found = np.exp(np.median(draws, axis=0))
     costs = [loss.sum((3, 4)) for loss in losses]
-    steps = [int(profile.argmin()) for profile in _profiles(costs)]
+    steps = _steps(losses)
     best = np.sum([cost.min(0) for cost in costs], axis=0)
     row, column = (int(k) for k in np.unravel_index(best.argmin(), best.shape))
     reflectance, unseen = _FINE[0][row], _FINE[1][column]
@@ -234,7 +236,12 @@ def _solved(
     return told, covariance
 
 
-def _inside(scales: np.ndarray, step: int, bounds: np.ndarray) -> bool:
+def _steps(losses: Sequence[np.ndarray]) -> list[int]:
+    """Which of its scales is best for each map, whose losses are (scales, rhos, shares, looks, blocks)."""
+    return [int(profile.argmin()) for profile in _profiles([loss.sum((3, 4)) for loss in losses])]
+
+
+def _goes_on(scales: np.ndarray, step: int, bounds: np.ndarray) -> bool:
     """Whether the best of the scales is their first or last, and not yet an end of what is searched."""
     return step in (0, len(scales) - 1) and bool(bounds[0] < scales[step] < bounds[-1])
 
