@@ -62,7 +62,7 @@ _CURES = (
     ("views of places", "use frames that are neither clipped nor dark, and keyframes that see the same wall"),
     ("shines from elsewhere", "check position_mm in light.json: is it this endoscope's, in camera axes?"),
     ("response does not fit", "check gamma in light.json: is it that of this recording?"),
-    ("a wall of reflectance", "measure the light on a board (calibrate-light --position), or give a known length"),
+    ("a wall of reflectance", "measure gamma and the light on a board (calibrate-light --position), or give a length"),
     ("shading hardly changes", "say how far the wall is, or give a known length"),
     ("offset is", "go nearer to the wall, or give a known length"),
     ("contradicts the known length", "measure the length again, or check light.json"),
