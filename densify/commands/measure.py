@@ -12,6 +12,7 @@ import numpy as np
 from densify.evaluation.judged_map import read_run
 from densify.measure import chosen_map, measured, places_in_frame, run_unit
 from densify.scale_file import scale_of
+from lightdepth.command_line.following import Input, command
 from lightdepth.command_line.outcome import end, outcome
 from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_rewritable
@@ -85,6 +86,6 @@ def measure(
         outcome().last(by if known is not None else str(scale))
     if output is not None:
         write_whole(output, json.dumps(plain(result), indent=1) + "\n")
-    kept = "lightdepth measure RUN ... -o lengths.json"
-    then = kept if output is None else "lightdepth export RUN -o runs/glb --to glb"
+    exported = command("export", Input("RUN", run), options={"-o": "runs/glb", "--to": "glb"})
+    then = "the same command with -o lengths.json" if output is None else exported
     end(*([output] if output else []), then=then, result=plain(result), doubts=doubts)

@@ -9,6 +9,7 @@ from typing import Annotated
 from densify.scale_file import FOLDER, scales_in
 from densify.scale_run import LengthGiven, ScaleAsked
 from densify.scaling import WALL_MM
+from lightdepth.command_line.following import PLACES, Input, command
 from lightdepth.command_line.outcome import end
 from lightdepth.errors import PartialFailure
 from lightdepth.ranges import above
@@ -53,4 +54,4 @@ def scale(
         out.record["maps"] = [asdict(one) for one in found.maps]
         if not found.told:
             out.fail("the scale", f"no map has a scale; {found.maps[0]}", now=False)
-    end(folder, then="lightdepth measure RUN --points '[[X, Y, Z], [X, Y, Z]]'")
+    end(folder, then=command("measure", Input("RUN", run), options={"--points": PLACES}))

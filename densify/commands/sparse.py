@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from shlex import quote
 from typing import Annotated
 
 import numpy as np
 
 from densify.inputs import MapSource, map_and_frames
+from lightdepth.command_line.following import Input, command
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
@@ -97,7 +97,9 @@ def sparse(
             frames = open_frames(source, run, None, sfm)
             known = None if poses is None else _poses(poses, frames, source, reading)
             made_sparse(run, frames.without_truth(), sfm, known, source.image_files)
-    end(output, then=f"lightdepth densify DATA --map {quote(str(output / 'sparse'))} -o runs/dense")
+    read_as = source.typed("--camera", "--fov")  # the map has the camera
+    options = {"--map": output / "sparse", **read_as, "-o": "runs/dense"}
+    end(output, then=command("densify", Input("DATA", data), options=options))
 
 
 def _poses(given: str, frames: FrameSequence, source: SequenceSource, reading: MapReading) -> dict[int, np.ndarray]:

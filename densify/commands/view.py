@@ -7,6 +7,7 @@ from shlex import quote
 from typing import Annotated
 
 from densify.scene import TRIANGLES
+from lightdepth.command_line.following import PLACES, Input, command
 from lightdepth.command_line.outcome import end, outcome
 from lightdepth.errors import InputError
 from lightdepth.files.replacing import check_rewritable
@@ -51,7 +52,8 @@ def view(
     viewing = Viewing.of(run, data, mm_per_unit, triangles)
     with finishing_first() as received:
         viewing.serve(host, port, received)
-        end(then="lightdepth measure RUN --points '[[X, Y, Z], [X, Y, Z]]' -o lengths.json", result=viewing.result)
+        then = command("measure", Input("RUN", run), options={"--points": PLACES, "-o": "lengths.json"})
+        end(then=then, result=viewing.result)
         received.stop("nothing was written")
 
 

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from lightdepth.command_line.dry import Planned
+from lightdepth.command_line.following import Following
 from lightdepth.command_line.heartbeat import Heartbeat, beating
 from lightdepth.command_line.warned import heard
 from lightdepth.errors import Interrupted, WrongUsage
@@ -128,7 +129,7 @@ def is_quiet() -> bool:
 
 def end(
     *written: Path,
-    then: str,
+    then: str | Following,
     page: Path | None = None,
     result: Mapping[str, Any] | None = None,
     doubts: Sequence[str] = (),
@@ -136,7 +137,7 @@ def end(
     """The last lines of a verb: what to type next, and what was written where, as the user named it. `page` is what to
     open first; `result` and `doubts` are of a verb without a run folder."""
     call = outcome()
-    call.then = then
+    call.then = then if isinstance(then, str) else then.anonymous
     if written and call.output is None:
         call.output, call.files = str(written[0]), [str(path) for path in written]
     if result is not None:
@@ -144,7 +145,8 @@ def end(
     for doubt in doubts:
         call.warned(doubt)
     if not call.quiet:
-        print(f"next: {for_line(then)}", flush=True)
+        said = then if isinstance(then, str) else then.said(to_terminal=sys.stdout.isatty())
+        print(f"next: {for_line(said)}", flush=True)
     opened = f"; open {for_line(str(page))}" if page is not None else ""
     if written:
         call.last(f"written: {', '.join(for_line(str(path)) for path in written)}{opened}")

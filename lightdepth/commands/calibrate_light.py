@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from shlex import quote
 from typing import Annotated
 
 import numpy as np
 
 from lightdepth.calibration import write_light
+from lightdepth.command_line.following import Input, command
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
 from lightdepth.datasets import FormatName, SequenceSource
+from lightdepth.datasets.no_camera import BOARD_NEEDS, NoCamera
 from lightdepth.datasets.with_map import open_with_map
 from lightdepth.detective import PairingConfig, check_pairing
 from lightdepth.detective.clock import by_the_images
@@ -84,7 +85,10 @@ def calibrate_light(
     found.page.links([(output.name, "the light, for --light of the other verbs")])
     write_together({page_path: found.page.write, output: lambda path: write_light(found.light, path)})
     print(f"light: {found.said}")
-    then = f"lightdepth densify DATA --map MAP --light {quote(str(output))} -o runs/dense"
+    of_wall = sought.position is None  # of a board, the frames of the wall are others
+    read_as = source.typed() if of_wall else {"--camera": Input("CAMERA", camera)}
+    options = {"--map": Input("MAP", map), **read_as, "--light": output, "-o": "runs/dense"}
+    then = command("densify", Input("DATA", data) if of_wall else "DATA", options=options)
     result = {"light": plain(found.light), **found.more, "said": found.said}
     end(output, page_path, then=then, page=page_path, result=result)
 
@@ -117,7 +121,13 @@ def _of_wall(source: SequenceSource, map: Path | None, pairing: PairingConfig, r
 
 def _of_board(source: SequenceSource, board: Board, config: LampsConfig, rng: np.random.Generator) -> _Found:
     """By a printed board, with the light's position."""
-    found = fit_on_board(source.open(), board, config, rng)
+    if source.asks_for_camera:
+        raise InputError("--camera auto", f"with {board.name}", BOARD_NEEDS)
+    try:
+        frames = source.open()
+    except NoCamera as error:
+        raise error.of_board() from error
+    found = fit_on_board(frames, board, config, rng)
     page = board_page(found, told(f"{source.data}, frames of {board.name}", data=source.data))
     more = {
         "interval_mm": plain([[a - w, a + w] for a, w in zip(found.fit.lamps.middle, found.half_width, strict=True)]),

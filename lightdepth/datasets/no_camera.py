@@ -9,6 +9,11 @@ from lightdepth.errors import InputError
 from lightdepth.option_names import option
 
 _FILE = 'FILE ({"model": "PINHOLE", "width": W, "height": H, "params": [fx, fy, cx, cy]})'
+BOARD_NEEDS = (
+    f"give --camera {_FILE}, or another program's (convert-camera lists them): a board's places are told by a "
+    "calibrated camera alone. The same board calibrates it, in OpenCV, MATLAB or Kalibr"
+)
+"""What to do where photographs of a board come without a camera."""
 _MAP = "or, where a verb takes --map, a map that has one"
 
 
@@ -23,6 +28,10 @@ class NoCamera(InputError):
         """For verbs that take --camera auto."""
         auto = "--camera auto to find it from the motion (--fov 70 where to start)"
         return NoCamera(self.where, self.found, f"give {option('camera')} {_FILE}, {auto}, {_MAP}")
+
+    def of_board(self) -> NoCamera:
+        """For photographs of a board, which shows nothing that tells the camera."""
+        return NoCamera(self.where, self.found, BOARD_NEEDS)
 
     def of_other_verb(self, data: Path | str, maps: bool = True) -> NoCamera:
         """For verbs that do not; `maps` whether they take one."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from lightdepth.camera import CameraModel
+from lightdepth.command_line.following import Input, Value
 from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.datasets.reading import FormatName, image_files, open_sequence
 from lightdepth.datasets.sequence import FrameSequence
@@ -68,6 +69,19 @@ class SequenceSource:
     def image_files(self) -> dict[int, str]:
         """Names of the frames' files by frame number; none of a video."""
         return image_files(self.data, self.format)
+
+    def typed(self, *left_out: str) -> dict[str, Value]:
+        """The options that read these frames again, for a command that comes next; some of them may be left out."""
+        light = Path(self.light) if self.light and "=" not in self.light else None
+        said: dict[str, Value] = {
+            "--format": self.format,
+            "--camera": Input("CAMERA", self.camera),
+            "--fov": None if self.fov is None else f"{self.fov:g}",
+            "--light": self.light if light is None else Input("LIGHT", light),
+            "--mask": Input("MASK", self.mask),
+            "--bit-depth": None if self.bit_depth is None else str(self.bit_depth),
+        }
+        return {option: value for option, value in said.items() if option not in left_out}
 
     @property
     def files(self) -> dict[str, Path | None]:

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from shlex import quote
 
 from safetensors.torch import load_file, save_file
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called, save_model
+from lightdepth.command_line.following import Input, Value, command
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
 from lightdepth.counting import counted
@@ -136,8 +136,8 @@ def adapt(
         made.files(run.folder, FILES)
         made.write(run.folder / "report.html")
         _record(run, start, target, module, data, config, outcome)
-    model = quote(str(output / "model.safetensors"))
-    then = f"lightdepth densify DATA --map MAP --checkpoint {model} -o runs/own"
+    own: dict[str, Value] = {"--checkpoint": output / "model.safetensors", "-o": "runs/own"}
+    then = command("densify", Input("DATA", source.data), options={"--map": Input("MAP", map), **source.typed(), **own})
     end(output, then=then, page=output / "report.html")
 
 

@@ -13,11 +13,11 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from pathlib import Path
-from shlex import quote
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from lightdepth.command_line.following import Input, Value, command
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
@@ -178,8 +178,8 @@ def select(
         if no_frames:
             paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
     print(summary)
-    place = quote(str(output))
-    then = f"lightdepth train --preset lightdepth -o runs/self --data.sequences '[DATA]' --data.frames {place}"
+    frames_of: dict[str, Value] = {"--data.sequences": Input("'[DATA]'", Path(f"[{data}]")), "--data.frames": output}
+    then = command("train", options={"--preset": "lightdepth", "-o": "runs/self", **frames_of})
     result = {"frames": len(verdicts), "kept": len(chosen), "rejected": dict(_rejected(verdicts))}
     beside = [path for path in writers if path != output]
     end(output, *beside, then=then, page=paths["page"], result=result, doubts=doubts)
