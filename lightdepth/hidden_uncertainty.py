@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel
 from scipy.spatial import cKDTree
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
@@ -31,7 +31,7 @@ LEVELS = (0.5, 0.68, 0.9)
 """Shares of points that intervals are stated for."""
 FILE = "uncertainty.json"
 
-_Z = norm.ppf((1 + np.asarray(LEVELS)) / 2)
+_Z = ndtri((1 + np.asarray(LEVELS)) / 2)
 _FACTORS = np.exp(np.linspace(np.log(0.05), np.log(20), 601))  # steps of 1 %
 _BESIDE, _AROUND, _NEIGHBOURS = 0.05, 0.1, 6  # in widths of the image
 _STICKS_OUT = 4.0  # deviations

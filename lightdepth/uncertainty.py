@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from lightdepth.reporting import figures
 
@@ -101,7 +101,7 @@ def sparsification(frames: Iterable[Doubted], power: int = 1) -> Sparsification:
 
 def coverage(frames: Sequence[Doubted], levels: Sequence[float] | np.ndarray = LEVELS) -> np.ndarray:
     """Share of pixels inside the central normal interval of each level, mean over frames (len(levels),)."""
-    factors = norm.ppf((1 + np.asarray(levels)) / 2)
+    factors = ndtri((1 + np.asarray(levels)) / 2)
     result: np.ndarray = np.mean(
         [(np.abs(f.error)[:, None] <= factors * f.sigma[:, None]).mean(0) for f in frames], axis=0
     )
@@ -135,7 +135,7 @@ def fit_calibration(frames: Sequence[Doubted]) -> Calibration:
 
     exponent = float(minimize_scalar(cost, bounds=(0.1, 4.0), method="bounded").x)
     ratio = [np.abs(f.error) / f.sigma**exponent for f in frames]
-    factors = norm.ppf((1 + np.asarray(LEVELS)) / 2)
+    factors = ndtri((1 + np.asarray(LEVELS)) / 2)
 
     def gap(log_scale: float) -> float:
         covered = np.mean([(r[:, None] <= factors * np.exp(log_scale)).mean(0) for r in ratio], axis=0)

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import rankdata
 
 from lightdepth.brief import Brief
 from lightdepth.datasets.counting import Counting
@@ -68,7 +67,14 @@ def _ranks(colors: np.ndarray) -> np.ndarray:
     """(n, 3), from 0 to 1, of colours (n, 3)."""
     red, green, blue = np.log(colors + _GRAIN).T
     kinds = np.stack([red - green, blue - green, (red + green + blue) / 3], 1)
-    result: np.ndarray = (rankdata(kinds, axis=0) - 1) / (len(colors) - 1)
+    return np.stack([_places(kind) for kind in kinds.T], 1) / (len(colors) - 1)
+
+
+def _places(values: np.ndarray) -> np.ndarray:
+    """(n,) of each value its place in the order, from 0; equal ones share the mean of theirs. As scipy.stats.rankdata
+    less 1, whose import takes every verb half a second."""
+    _, kind, counts = np.unique(values, return_inverse=True, return_counts=True)
+    result: np.ndarray = (np.cumsum(counts) - (counts + 1) / 2)[kind]
     return result
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from lightdepth.counting import counted
 from lightdepth.datasets import FrameSequence
@@ -82,7 +82,7 @@ class BoardFit:
     @property
     def half_width(self) -> np.ndarray:
         """(3,) mm: half the 90 % interval of x, y and z."""
-        found: np.ndarray = self.deviation * student.ppf((1 + CONFIDENCE) / 2, len(self.whites) - 1)
+        found: np.ndarray = self.deviation * stdtrit(len(self.whites) - 1, (1 + CONFIDENCE) / 2)
         return found
 
     @property

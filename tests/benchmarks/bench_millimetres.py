@@ -28,7 +28,7 @@ from lightdepth.judge_colons.endoscope import Exposure, LensKind
 from lightdepth.judge_colons.lamps import Lamp
 from lightdepth.light.looks import typical_distance
 from lightdepth.light.millimetres import Look, Millimetres, millimetres
-from lightdepth.photometry import PhotometricCalibration
+from lightdepth.photometry import MeasuredLamps, PhotometricCalibration
 from lightdepth.tube import render_sequence
 
 ENLARGED = int(os.environ.get("LIGHTDEPTH_ENLARGED", "2"))  # times 160x128, of the tube
@@ -61,6 +61,7 @@ def frames_at(
     return list(render_sequence(seed, frames, lens, 24.0, None, light).frames), light
 
 
+@cache
 def tube(seed: int, much: bool) -> Colon:
     share, reflectance = drawn(seed, much)
     frames, light = frames_at(seed, LENSES[seed % 2], share, reflectance)
@@ -69,6 +70,12 @@ def tube(seed: int, much: bool) -> Colon:
         assert f.true_distance is not None and f.true_world_from_cam is not None
         looks.append(Look(f.camera, np.linalg.inv(f.true_world_from_cam), f.image, f.valid, f.true_distance))
     return looks, light, reflectance
+
+
+def measured(seed: int, much: bool) -> Colon:
+    """As `tube`, of a light that was measured on a board: so the response and the lamp's place are sure."""
+    looks, light, reflectance = tube(seed, much)
+    return looks, replace(light, lamps=MeasuredLamps((light.position_mm,), (1.0,), (0.0, 0.0, 0.0))), reflectance
 
 
 @cache
@@ -107,6 +114,7 @@ def without_the_lens(seed: int, much: bool) -> Colon:
 
 WORLDS = (
     ("tube", tube, FIRST, COUNT),
+    ("tube, its light measured on a board", measured, FIRST, COUNT),
     ("other renderer, the lens's share of mu known", other, OTHER_FIRST, OTHER_COUNT),
     ("other renderer, it is not known", without_the_lens, OTHER_FIRST, OTHER_COUNT),
 )
