@@ -125,13 +125,25 @@ def scale_of(run: Path, map_id: int) -> MapScale | None:
     return found.get(_unit_of(run, map_id) if own and run.name.startswith("joined_") else map_id)
 
 
-def scales_in(folder: Path) -> bool:
-    """Whether a folder has a scale.json with a figure in it; one that is spoilt has none."""
+def figures_in(folder: Path) -> dict[int, float]:
+    """Millimetres per unit that the scale.json in a folder has, by map; one that is spoilt has none."""
     try:
         fields = checked_fields(_ScaleFields, read_json(folder / FILE), str(folder / FILE))
     except (InputError, OSError):
-        return False
-    return any(one.mm_per_unit is not None for one in fields.maps)
+        return {}
+    return {one.map: one.mm_per_unit for one in fields.maps if one.mm_per_unit is not None}
+
+
+def replaced(before: Mapping[int, float], now: Mapping[int, float]) -> str:
+    """What becomes of figures (millimetres per unit, by map) that were there, in a sentence; empty where they stay as
+    they are shown."""
+
+    def shown(told: Mapping[int, float], map_id: int) -> str:
+        return f"{told[map_id]:.4g}" if map_id in told else "none"
+
+    moved = {i: (shown(before, i), shown(now, i)) for i in before}
+    changed = [f"map {i} had {old} mm per map unit, now {new}" for i, (old, new) in moved.items() if old != new]
+    return f"replaces the scale of before: {'; '.join(changed)}" if changed else ""
 
 
 def unit_told(folder: Path) -> str:

@@ -214,6 +214,17 @@ def test_a_scale_that_finds_nothing_leaves_the_figures_of_before(made, told, cap
     assert json.loads((made.parent / "own" / "scale.json").read_text())["maps"][0]["mm_per_unit"] is None
 
 
+def test_a_scale_that_replaces_other_figures_says_in_one_line_which(made, told, capsys):
+    told(figure(2.0), figure(3.0))
+    assert main(["scale", str(made)]) == 0 and "replaces the" not in capsys.readouterr().out
+    assert main(["scale", str(made)]) == 0 and "replaces the" not in capsys.readouterr().out  # by the same ones
+    told(figure(2.5), figure(3.0, FLAT))
+    assert main(["scale", str(made)]) == 0
+    line = "replaces the scale of before: map 0 had 2 mm per map unit, now 2.5; map 1 had 3 mm per map unit, now none"
+    assert line in capsys.readouterr().out.splitlines()
+    assert json.loads((made / "scale" / "run.json").read_text())["replaced"] == {"0": 2.0, "1": 3.0}
+
+
 def test_the_reason_of_a_run_of_one_map_is_told_once(tmp_path, told, capsys):
     told(figure(2.345, FLAT))
     made = run_of(tmp_path, (0,), LIGHT)
