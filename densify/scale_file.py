@@ -48,7 +48,11 @@ class MapScale:
     views: int = 0
     """number of views of places that were compared"""
     refused: str = ""
+    """why there is no figure; empty where there is one"""
     cure: str = ""
+    """what to do about a refusal, of the light too"""
+    light_refused: str = ""
+    """why the light told nothing, where a known length tells the figure alone"""
 
     @classmethod
     def of(cls, map_id: int, found: Millimetres) -> MapScale:
@@ -56,7 +60,8 @@ class MapScale:
         known = found.reflectance if np.isfinite(found.reflectance) else None
         if found.refused:
             return cls(map_id, None, None, "", None, found.views, found.refused, found.cure)
-        return cls(map_id, found.mm_per_unit, found.interval, found.by, known, found.views)
+        light = {"cure": found.cure, "light_refused": found.light_refused}
+        return cls(map_id, found.mm_per_unit, found.interval, found.by, known, found.views, **light)
 
     @property
     def reach(self) -> float:
@@ -68,7 +73,8 @@ class MapScale:
             return f"map {self.map}: no millimetres, {self.refused}; {self.cure}"
         low, high = self.interval
         figure = f"{self.mm_per_unit:.4g} mm per map unit, nine of ten such are within {low:.4g} to {high:.4g}"
-        return f"map {self.map}: {figure}, by {self.by}"
+        light = f"; the light tells none, {self.light_refused}; {self.cure}" if self.light_refused else ""
+        return f"map {self.map}: {figure}, by {self.by}{light}"
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,7 @@ class _MapFields(BaseModel):
     views: int
     refused: str
     cure: str
+    light_refused: str = ""  # files of earlier versions do not say it
 
 
 class _ScaleFields(BaseModel):

@@ -258,6 +258,24 @@ def test_what_the_light_really_refuses_reaches_the_user(light, why, tmp_path, ca
     assert (one["mm_per_unit"], one["interval"]) == (None, None) and one["cure"]
 
 
+def test_a_light_that_is_refused_beside_a_length_is_told_in_the_file_and_on_the_terminal(made, capsys):
+    argv = ["--length.ends", "[[0, 0, 5], [0, 3, 9]]", "--length.mm", "10", "--length.map", "1"]
+    assert main(["scale", str(made), "--light", "gamma=2.2,mu=0", *argv]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("map 1: 2 mm per map unit")]
+    assert "by a known length; the light tells none, the light is said to sit in the camera" in line
+    assert line.endswith("say in light.json where it sits: position_mm, in camera axes")
+    file = made / "scale" / "scale.json"
+    record = json.loads(file.read_text())
+    one = record["maps"][1]
+    assert one["refused"] == "" and "sit in the camera" in one["light_refused"] and "position_mm" in one["cure"]
+    assert scale_of(made, 1) == MapScale(**one | {"interval": tuple(one["interval"])})
+    for each in record["maps"]:
+        del each["light_refused"]  # as earlier versions wrote it
+    file.write_text(json.dumps(record))
+    found = scale_of(made, 1)
+    assert found is not None and found.mm_per_unit == 2 and found.light_refused == ""
+
+
 def test_a_given_light_wins_and_a_length_tells_its_map_where_the_light_tells_none(made, capsys):
     argv = ["--length.ends", "[[0, 0, 5], [0, 3, 9]]", "--length.mm", "10", "--length.map", "1"]
     assert main(["scale", str(made), "--light", "gamma=2.2,mu=0", *argv]) == 0
