@@ -91,6 +91,8 @@ def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = F
             joined_section(page, work.merged)
         page.files(run.folder, FILES)
         page.write(run.folder / "report.html")
+        if work.without_millimetres:  # it was warned of long ago
+            run.log(work.without_millimetres)
 
 
 @contextmanager

@@ -94,20 +94,30 @@ class Densified:
         self.scales = found = scales_of(maps, frames, light, wall_mm)
         for one in found.maps:
             (run.log if one.mm_per_unit is not None else run.warn)(str(one))
-        if found.told and not found.all_told:
-            run.log("surfaces stay in map units: not every map has a scale")
         found.write_file(run.folder, "mm" if found.all_told else "map units", light)
         return found.told if found.all_told else None
 
     @property
     def of_millimetres(self) -> str:
-        """What the verdict says of millimetres that the light told; empty where there are none."""
-        if self.scales is None or not self.scales.all_told:
+        """What the verdict says of millimetres that the light was asked for; empty where it was not."""
+        if self.scales is None:
             return ""
+        if not self.scales.all_told:
+            return "the surfaces are in map units, as the light tells no millimetres"
         reach = max(one.reach for one in self.scales.maps) - 1
         return (
             f"the colour says nothing about the millimetres, which the light gave: nine of ten are within {reach:.0%}"
         )
+
+    @property
+    def without_millimetres(self) -> str:
+        """That the light was asked for millimetres in vain, the first reason, and its cure; empty where it was not."""
+        if self.scales is None or self.scales.all_told:
+            return ""
+        refused = [one for one in self.scales.maps if one.mm_per_unit is None]
+        maps = ", ".join(str(one.map) for one in refused)
+        why = "".join(f" of map {maps}: {one.refused}; {one.cure}" for one in refused[:1])
+        return f"the surfaces are in map units: the light tells no millimetres{why}"
 
     @property
     def verdict(self) -> Verdict | None:
