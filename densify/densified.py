@@ -23,7 +23,7 @@ from densify.resuming import kept_result
 from densify.scale_file import MmPerUnit, Scales, factor
 from densify.scaling import SeenMap, scales_of
 from densify.scene import seen_kinds
-from lightdepth.counting import counted
+from lightdepth.counting import counted, full_stop
 from lightdepth.datasets import FrameSequence
 from lightdepth.depth_gate import sentence
 from lightdepth.errors import InputError
@@ -166,10 +166,10 @@ class Densified:
         """Sentences for the page: what the surfaces were made of (`of`), under which light, and what is weak."""
         light = frames.first().light
         under = f"gamma {light.gamma:.3g}, mu {light.mu:.3g} ({light.source})"
-        notes = [f"Verdict: {self.headline}."] if self.headline else []
+        notes = [full_stop(f"Verdict: {self.headline}")] if self.headline else []
         notes += [f"{of}; depth by {self.model}; light of the frames: {under}."]
         notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
-        notes += [f"Millimetres, {one}." for one in (self.scales.maps if self.scales is not None else ())]
+        notes += [full_stop(f"Millimetres, {one}") for one in (self.scales.maps if self.scales is not None else ())]
         notes.append(f"Uncertainty: {self.of_uncertainty}.")
         notes += [f"Light: {self.doubted}."] if self.doubted else []
         told = [(r.dense.submap.id, r.dense.unsure_share) for r in self.results]

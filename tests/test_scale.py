@@ -202,8 +202,9 @@ def test_a_scale_that_finds_nothing_leaves_the_figures_of_before(made, told, cap
     told(figure(2.345, FLAT), figure(2.345, FLAT))
     capsys.readouterr()
     assert main(["scale", str(made)]) == 4
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert "map 1: no millimetres, shading hardly changes" in said and "keeps the figures that it had" in said
+    ended = capsys.readouterr()
+    assert "map 1: no millimetres, shading hardly changes" in ended.out
+    assert "keeps the figures that it had" in ended.err.splitlines()[-1]
     assert main(["scale", str(made), "-o", str(made.parent / "own"), "--overwrite"]) == 4
     for folder in (made / "scale", made.parent / "own"):
         assert (folder / "scale.json").read_text() == before and json.loads((folder / "run.json").read_text())
@@ -223,6 +224,23 @@ def test_a_scale_that_replaces_other_figures_says_in_one_line_which(made, told, 
     line = "replaces the scale of before: map 0 had 2 mm per map unit, now 2.5; map 1 had 3 mm per map unit, now none"
     assert line in capsys.readouterr().out.splitlines()
     assert json.loads((made / "scale" / "run.json").read_text())["replaced"] == {"0": 2.0, "1": 3.0}
+
+
+def test_both_refusals_of_a_scale_have_one_form_and_a_question_is_no_end_of_a_sentence(made, told, capsys):
+    """The first folder has no figures, the second has some that it keeps."""
+    elsewhere = "the light shines from elsewhere: the images put it 30 degrees around the axis from its place"
+    refused_twice = figure(2.345, elsewhere), figure(2.345, FLAT)
+    why = f"no map has a scale; map 0: no millimetres, {elsewhere}; check position_mm in light.json: is it this "
+    why += "endoscope's, in camera axes?"
+    for ending in ("has the reason of each map", "keeps the figures that it had"):
+        told(*refused_twice)
+        capsys.readouterr()
+        assert main(["scale", str(made)]) == 4
+        ended = capsys.readouterr()
+        assert ended.err.splitlines()[-1] == f"lightdepth scale: {why} {made / 'scale'} {ending}"
+        assert ended.out.splitlines()[0].startswith(f"map 1: no millimetres, {FLAT}")
+        told(figure(2.0), figure(3.0))
+        assert main(["scale", str(made)]) == 0
 
 
 def test_the_reason_of_a_run_of_one_map_is_told_once(tmp_path, told, capsys):

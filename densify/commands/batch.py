@@ -18,7 +18,7 @@ from densify.joining import MergeConfig
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
-from lightdepth.counting import counted
+from lightdepth.counting import counted, full_stop
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import PartialFailure
 from lightdepth.reporting.names import KEPT
@@ -90,5 +90,5 @@ def batch(
     if failures := told_failures(lines):
         first = "; ".join(failures[:_MOST_NAMED]) + ("; ..." if len(failures) > _MOST_NAMED else "")
         said = f"{counted(len(failures), 'sequence')} of {len(lines)} failed: {first}"
-        raise PartialFailure(f"{said}. The rest is in {output}")
+        raise PartialFailure(f"{full_stop(said)} The rest is in {output}")
     end(output, then=f"cat {quote(str(output / 'table.csv'))}", page=output / PAGE)
