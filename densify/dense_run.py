@@ -21,6 +21,7 @@ from densify.scale_file import MmPerUnit
 from lightdepth.calibration import read_light
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.outcome import OUTCOME, Outcome
+from lightdepth.counting import full_stop
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.light.millimetres import unplaced
 from lightdepth.models import DepthModel
@@ -85,12 +86,14 @@ def dense_run(asked: Asked, model: DepthModel, output: Path, overwrite: bool = F
         notes = work.notes(f"{source.data}, {sparse_map.source}", frames, run.record.get("light_fit"))
         notes += [f"Poses: {told['sentence']}." for told in run.record.get("polish", ())]
         notes += [f"Warning: {said}" for said in run.record["warnings"]]
-        notes += [f"Map {map_id}: {proposal}." for map_id, proposal in proposals.items()]
+        notes += [full_stop(f"Map {map_id}: {proposal}") for map_id, proposal in proposals.items()]
         page = densify_page("Densified maps", work.results, work.gallery, notes, None, mm_per_unit, merged=work.merged)
         if work.merged is not None:
             joined_section(page, work.merged)
         page.files(run.folder, FILES)
         page.write(run.folder / "report.html")
+        if work.without_millimetres:  # it was warned of long ago
+            run.log(work.without_millimetres)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from densify.resuming import kept_result
 from densify.scale_file import MmPerUnit, Scales, factor
 from densify.scaling import SeenMap, scales_of
 from densify.scene import seen_kinds
-from lightdepth.counting import counted
+from lightdepth.counting import counted, full_stop
 from lightdepth.datasets import FrameSequence
 from lightdepth.depth_gate import sentence
 from lightdepth.errors import InputError
@@ -94,20 +94,30 @@ class Densified:
         self.scales = found = scales_of(maps, frames, light, wall_mm)
         for one in found.maps:
             (run.log if one.mm_per_unit is not None else run.warn)(str(one))
-        if found.told and not found.all_told:
-            run.log("surfaces stay in map units: not every map has a scale")
         found.write_file(run.folder, "mm" if found.all_told else "map units", light)
         return found.told if found.all_told else None
 
     @property
     def of_millimetres(self) -> str:
-        """What the verdict says of millimetres that the light told; empty where there are none."""
-        if self.scales is None or not self.scales.all_told:
+        """What the verdict says of millimetres that the light was asked for; empty where it was not."""
+        if self.scales is None:
             return ""
+        if not self.scales.all_told:
+            return "the surfaces are in map units, as the light tells no millimetres"
         reach = max(one.reach for one in self.scales.maps) - 1
         return (
             f"the colour says nothing about the millimetres, which the light gave: nine of ten are within {reach:.0%}"
         )
+
+    @property
+    def without_millimetres(self) -> str:
+        """That the light was asked for millimetres in vain, the first reason, and its cure; empty where it was not."""
+        if self.scales is None or self.scales.all_told:
+            return ""
+        refused = [one for one in self.scales.maps if one.mm_per_unit is None]
+        maps = ", ".join(str(one.map) for one in refused)
+        why = "".join(f" of map {maps}: {one.refused}; {one.cure}" for one in refused[:1])
+        return f"the surfaces are in map units: the light tells no millimetres{why}"
 
     @property
     def verdict(self) -> Verdict | None:
@@ -156,10 +166,10 @@ class Densified:
         """Sentences for the page: what the surfaces were made of (`of`), under which light, and what is weak."""
         light = frames.first().light
         under = f"gamma {light.gamma:.3g}, mu {light.mu:.3g} ({light.source})"
-        notes = [f"Verdict: {self.headline}."] if self.headline else []
+        notes = [full_stop(f"Verdict: {self.headline}")] if self.headline else []
         notes += [f"{of}; depth by {self.model}; light of the frames: {under}."]
         notes += [f"Light {light_fit['summary']}."] if light_fit is not None else []
-        notes += [f"Millimetres, {one}." for one in (self.scales.maps if self.scales is not None else ())]
+        notes += [full_stop(f"Millimetres, {one}") for one in (self.scales.maps if self.scales is not None else ())]
         notes.append(f"Uncertainty: {self.of_uncertainty}.")
         notes += [f"Light: {self.doubted}."] if self.doubted else []
         told = [(r.dense.submap.id, r.dense.unsure_share) for r in self.results]

@@ -18,6 +18,7 @@ from densify.scale_file import MmPerUnit, factor
 from densify.scene import KINDS, SURFACE_FILES, TRUSTED, seen_kinds, surface_of, tangents
 from densify.thumbnails import Thumbnails, said
 from lightdepth.camera import CameraModel
+from lightdepth.counting import full_stop
 from lightdepth.reporting.figures import (
     BAD,
     GOOD,
@@ -263,7 +264,7 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
         j = result.judgement
         if j is None:
             continue
-        said = [f"{result.verdict}."] if len(results) > 1 else []  # a single one is said above
+        said = [full_stop(str(result.verdict))] if len(results) > 1 else []  # a single one is said above
         if j.surface is not None:
             missed = f"{100 * j.surface.miss:.0f} % of the rays to places that the images measured miss the surface"
             few = "" if spoke(j.surface) else f" ({j.surface.points} pixels, too few to judge by)"
@@ -271,7 +272,7 @@ def _judged(page: Report, results: Sequence[SubmapResult]) -> None:
         braked = [a for a in result.dense.alignments if a.unbent_because]
         if braked:
             kept = f"{j.undone} keyframes lost their bend (one scale is left), {j.lessened} kept a part of it"
-            said.append(f"{kept}. Keyframe {braked[0].keyframe}: {braked[0].unbent_because}.")
+            said.append(full_stop(f"{kept}. Keyframe {braked[0].keyframe}: {braked[0].unbent_because}"))
         if said:
             page.text(f"Map {result.dense.submap.id}: {' '.join(said)}")
 

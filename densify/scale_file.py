@@ -48,7 +48,11 @@ class MapScale:
     views: int = 0
     """number of views of places that were compared"""
     refused: str = ""
+    """why there is no figure; empty where there is one"""
     cure: str = ""
+    """what to do about a refusal, of the light too"""
+    light_refused: str = ""
+    """why the light told nothing, where a known length tells the figure alone"""
 
     @classmethod
     def of(cls, map_id: int, found: Millimetres) -> MapScale:
@@ -56,7 +60,8 @@ class MapScale:
         known = found.reflectance if np.isfinite(found.reflectance) else None
         if found.refused:
             return cls(map_id, None, None, "", None, found.views, found.refused, found.cure)
-        return cls(map_id, found.mm_per_unit, found.interval, found.by, known, found.views)
+        light = {"cure": found.cure, "light_refused": found.light_refused}
+        return cls(map_id, found.mm_per_unit, found.interval, found.by, known, found.views, **light)
 
     @property
     def reach(self) -> float:
@@ -68,7 +73,8 @@ class MapScale:
             return f"map {self.map}: no millimetres, {self.refused}; {self.cure}"
         low, high = self.interval
         figure = f"{self.mm_per_unit:.4g} mm per map unit, nine of ten such are within {low:.4g} to {high:.4g}"
-        return f"map {self.map}: {figure}, by {self.by}"
+        light = f"; the light tells none, {self.light_refused}; {self.cure}" if self.light_refused else ""
+        return f"map {self.map}: {figure}, by {self.by}{light}"
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,7 @@ class _MapFields(BaseModel):
     views: int
     refused: str
     cure: str
+    light_refused: str = ""  # files of earlier versions do not say it
 
 
 class _ScaleFields(BaseModel):
@@ -125,13 +132,25 @@ def scale_of(run: Path, map_id: int) -> MapScale | None:
     return found.get(_unit_of(run, map_id) if own and run.name.startswith("joined_") else map_id)
 
 
-def scales_in(folder: Path) -> bool:
-    """Whether a folder has a scale.json with a figure in it; one that is spoilt has none."""
+def figures_in(folder: Path) -> dict[int, float]:
+    """Millimetres per unit that the scale.json in a folder has, by map; one that is spoilt has none."""
     try:
         fields = checked_fields(_ScaleFields, read_json(folder / FILE), str(folder / FILE))
     except (InputError, OSError):
-        return False
-    return any(one.mm_per_unit is not None for one in fields.maps)
+        return {}
+    return {one.map: one.mm_per_unit for one in fields.maps if one.mm_per_unit is not None}
+
+
+def replaced(before: Mapping[int, float], now: Mapping[int, float]) -> str:
+    """What becomes of figures (millimetres per unit, by map) that were there, in a sentence; empty where they stay as
+    they are shown."""
+
+    def shown(told: Mapping[int, float], map_id: int) -> str:
+        return f"{told[map_id]:.4g}" if map_id in told else "none"
+
+    moved = {i: (shown(before, i), shown(now, i)) for i in before}
+    changed = [f"map {i} had {old} mm per map unit, now {new}" for i, (old, new) in moved.items() if old != new]
+    return f"replaces the scale of before: {'; '.join(changed)}" if changed else ""
 
 
 def unit_told(folder: Path) -> str:

@@ -139,7 +139,9 @@ def test_frames_that_show_nothing_are_refused(start, tmp_path, value, said, cure
         adapted(start, tmp_path / "data", tmp_path / "run")
 
 
-def test_a_network_that_got_worse_is_not_written_unless_asked_for(start, sequences, tmp_path, monkeypatch):
+def test_a_network_that_got_worse_is_not_written_unless_asked_for_and_its_verdict_is_told_once(
+    start, sequences, tmp_path, monkeypatch, capsys
+):
     original = Adaptation.batch_loss
 
     def astray(self, batch):
@@ -148,10 +150,17 @@ def test_a_network_that_got_worse_is_not_written_unless_asked_for(start, sequenc
 
     monkeypatch.setattr(Adaptation, "batch_loss", astray)
     run = tmp_path / "run"
-    with pytest.raises(PartialFailure, match=r"model\.safetensors: not written, nothing better than start was found"):
+    with pytest.raises(
+        PartialFailure, match=r"model\.safetensors: not written, nothing better than start was found"
+    ) as raised:
         adapted(start, sequences / "truth", run)
     record = json.loads((run / "run.json").read_text())
     assert record["criterion"] == "truth" and not record["better"] and not record["written"]
+    said = capsys.readouterr().out + str(raised.value)
+    assert said.count(record["verdict"]) == said.count("AbsRel of the held-out frames") == 1
+    assert record["failures"] == [
+        {"what": "model.safetensors", "reason": "not written, nothing better than start was found"}
+    ]
     assert not list(run.glob("model*")) and "--keep-worse" in (run / "report.html").read_text()
     kept = adapted(start, sequences / "truth", run, keep_worse=True, overwrite=True)
     assert not kept["better"] and kept["written"] and (run / "model.safetensors").is_file()

@@ -306,7 +306,13 @@ def test_copies_are_two_sequences_and_the_same_row_twice_is_one(data, tmp_path, 
     assert batch(tmp_path / "list.csv", tmp_path / "out") == 0
     one, two = read_table(tmp_path / "out")
     assert two["sequence"] == f"{one['sequence']}-2" and one["vertices"] == two["vertices"]
-    assert "The manifest repeats 1 row." in (tmp_path / "out" / "report.html").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "The manifest repeats 1 row." in page
+    warned = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    assert len(warned) == 1 and warned[0].startswith("warning: 1 sequence has the same frames as another one, ")
+    assert warned[0].endswith(f": {first} and {tmp_path / 'copy'}")
+    named = f"{one['sequence']} and {two['sequence']}."
+    assert named in page and json.loads((tmp_path / "out" / "run.json").read_text())["warnings"][1].endswith(named)
 
 
 def test_the_checkpoint_is_loaded_once_for_all_sequences_of_a_process(data, tmp_path, monkeypatch):

@@ -148,6 +148,21 @@ def test_what_cannot_be_told_apart_is_a_unit_with_its_trouble_and_stops_no_other
     )
 
 
+def test_the_same_frames_at_two_places_are_told_and_the_same_place_with_other_options_is_not(tmp_path):
+    for name in ("a", "b", "c"):
+        pictures(tmp_path / name, 3)
+    pictures(tmp_path / "other", 3, first=20), pictures(tmp_path / "longer", 4)
+
+    def said(text: str) -> str:
+        return batch_units.said_of_copies(
+            batch_units.units_of(rows_of(tmp_path, text), asked_of_all()), lambda unit: unit.row.data.name
+        )
+
+    assert said('data,light\na,\na,"gamma=2,mu=1"\nother,\nlonger,\n') == ""
+    assert said("data\na\nother\nb\nc\n").startswith("2 sequences have the same frames as another one, ")
+    assert said('data,light\na,\nlonger,\nb,"gamma=2,mu=1"\n').endswith(": a and b")
+
+
 def test_a_file_for_all_sequences_that_cannot_be_read_is_refused_before_any_work(tmp_path):
     pictures(tmp_path / "a", 3)
     (tmp_path / "wrong").write_text("no light, no camera and no picture")

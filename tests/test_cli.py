@@ -260,6 +260,9 @@ def test_where_the_light_tells_no_millimetres_surfaces_stay_in_map_units_and_why
     assert lightdepth("densify", data, *argv) == 0
     said = capsys.readouterr().out
     assert "warning: map 0: no millimetres, nobody gave the light" in said and "mm per map unit" not in said
+    last = said.splitlines()[-3]  # what to type next, and what was written, come after it
+    assert last.startswith("the surfaces are in map units: the light tells no millimetres of map 0, 1: nobody gave the")
+    assert last.endswith("give it: --light light.json, with position_mm and a source other than assumed")
     record = json.loads((tmp_path / "dense" / "run.json").read_text())
     assert record["unit"] == "map units" and any("nobody gave the light" in w for w in record["warnings"])
     told = json.loads((tmp_path / "dense" / "scale.json").read_text())

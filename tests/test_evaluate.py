@@ -19,7 +19,7 @@ from verbs import by_options
 
 from densify.commands.evaluate import evaluate as evaluate_verb
 from densify.config import DensifyConfig
-from densify.evaluation.files import long_rows, write_evaluations
+from densify.evaluation.files import check_no_truth_lost, long_rows, write_evaluations
 from densify.evaluation.in_short import in_short
 from densify.evaluation.judge import judge_maps
 from densify.evaluation.judge_depth import judge_depth
@@ -120,6 +120,21 @@ def test_withheld_points_are_in_every_report_with_a_constant_distance_beside(jud
     assert "| map 0 | this depth | 40 |" in (tmp_path / "without" / "metrics.md").read_text()
     assert "<h1>Agreement with the sparse map</h1>" in (tmp_path / "without" / "report.html").read_text()
     assert "<h1>Errors against truth</h1>" in (judged / "report.html").read_text()
+
+
+def test_metrics_against_truth_are_not_replaced_by_metrics_without_unless_asked(judged, run, data, tmp_path):
+    mine = shutil.copytree(run, tmp_path / "run")
+    shutil.copytree(judged, mine / "evaluation")
+    before = (mine / "evaluation" / "metrics.json").read_text()
+    with refused(where="evaluation", found="metrics against truth", cure="--truth DATA") as told:
+        evaluate(mine)
+    assert "--overwrite" in told.value.cure and (mine / "evaluation" / "metrics.json").read_text() == before
+    assert sorted(path.name for path in mine.iterdir()) == ["evaluation", "map_000", "map_001", "run.json"]
+    evaluate(mine, overwrite=True)
+    assert metrics(mine / "evaluation")["truth_folder"] is None
+    evaluate(mine)  # neither has truth
+    (mine / "evaluation" / "metrics.json").write_text("spoilt")
+    check_no_truth_lost(mine / "evaluation")
 
 
 def test_tables_are_laid_out_as_the_paper_s(judged):

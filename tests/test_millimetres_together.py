@@ -73,6 +73,7 @@ def test_a_length_tells_its_own_map_where_the_light_tells_nothing():
     first, second = weighed(light, KnownLength(0, 4.0, 8.0, 0.8)).maps
     assert (first.mm_per_unit, first.by, first.refused) == (2.0, LENGTH, "")
     assert first.deviation == pytest.approx(0.1) and second.refused.startswith("nobody gave the light")
+    assert first.light_refused == second.refused and first.cure.startswith("give it: --light")
     low, high = first.interval
     assert low * high == pytest.approx(4.0) and low == pytest.approx(2.0 * np.exp(-0.1645))
 
@@ -83,6 +84,7 @@ def test_where_length_and_light_contradict_each_other_the_light_is_not_believed_
     assert (first.mm_per_unit, first.by, first.refused) == (2.0, LENGTH, "")
     assert second.refused == "the light contradicts the known length, by which units are 2.00 times as large"
     assert second.cure.startswith("measure the length again")
+    assert first.light_refused == second.refused and first.cure == second.cure and second.light_refused == ""
 
 
 @pytest.mark.parametrize(("units", "mm", "error"), [(0.0, 5.0, 1.0), (1.0, -5.0, 1.0), (1.0, 5.0, 0.0)])

@@ -225,6 +225,12 @@ MISTAKES = {
     "whole number": ("synth", ["-o", "O", "--frames", "1.5"], "--frames 1.5: expected a whole number."),
     "two numbers": ("synth", ["-o", "O", "--size", "3"], "--size 3: expected 2 whole numbers"),
     "nothing after it": ("predict", ["D", "-o"], "-o needs a value."),
+    "an empty number": ("scale", ["R", "--wall-mm", ""], "--wall-mm '': expected a number. Read on"),
+    "an empty list": (
+        "scale",
+        ["R", "--length.ends="],
+        "--length.ends '': expected a list, each 3 numbers, as [N, N, N]",
+    ),
     "no output": ("predict", ["D"], "missing: -o OUTPUT."),
     "no data": ("predict", ["-o", "O"], "missing: DATA."),
     "a word too many": ("predict", ["D", "E", "-o", "O"], "E: nothing takes this word"),

@@ -84,16 +84,19 @@ def test_the_recording_names_no_path(run, recorded):
     assert data.startswith(b"RRF2") and CANARY.encode() not in data and str(run.parent).encode() not in data
 
 
-def test_a_recording_is_written_anew_and_nothing_else_is_replaced(run, tmp_path, recorded):
+def test_a_recording_is_written_anew_if_that_is_asked_and_nothing_else_is_replaced(run, tmp_path, recorded):
     path = tmp_path / "again.rrd"
     path.write_bytes(recorded.read_bytes()[:1000])
-    view(run, rerun=path, triangles=2000)
+    with refused(where="again.rrd", found="already there", cure="--overwrite"):
+        view(run, rerun=path, triangles=2000)
+    view(run, rerun=path, triangles=2000, overwrite=True)
     told = columns(path, "/map_000/surface/of_the_images")
     assert 1900 <= len(told["Mesh3D:triangle_indices"][0]) <= 2000
     theirs = tmp_path / "theirs.rrd"
     theirs.write_text("a letter")
-    with refused(found="was not made by this verb"):
-        view(run, rerun=theirs)
+    for overwrite in (False, True):
+        with refused(found="was not made by this verb"):
+            view(run, rerun=theirs, overwrite=overwrite)
     with refused(where="--rerun", found="does not end in .rrd"):
         view(run, rerun=tmp_path / "run.mp4")
     assert theirs.read_text() == "a letter" and not (tmp_path / "run.mp4").exists()

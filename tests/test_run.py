@@ -16,6 +16,7 @@ import pytest
 import yaml
 from raising import refused
 
+from lightdepth.counting import full_stop
 from lightdepth.errors import AlreadyFinished, InputError, PartialFailure
 from lightdepth.reporting.progress import Progress
 from lightdepth.reporting.record import git_revision, versions, write_run_json
@@ -145,6 +146,15 @@ def test_part_of_the_work_may_fail_and_the_rest_is_written(tmp_path):
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert record["failures"] == [{"what": "7", "reason": "truncated"}, {"what": "9", "reason": "missing"}]
     assert (tmp_path / "out" / "8.npz").is_file()
+
+
+def test_a_reason_that_is_a_question_gets_no_full_stop(tmp_path):
+    assert [full_stop(said) for said in ("dark", "whose?", "so.", "no!")] == ["dark.", "whose?", "so.", "no!"]
+    with (
+        pytest.raises(PartialFailure, match=r"in camera axes\? The rest is in .*out"),
+        run_folder(tmp_path / "out", "predict", {}) as run,
+    ):
+        run.fail("7", "is it this endoscope's, in camera axes?")
 
 
 def test_the_hash_changes_with_contents_names_and_sizes_and_with_nothing_else(tmp_path):

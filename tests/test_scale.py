@@ -202,8 +202,9 @@ def test_a_scale_that_finds_nothing_leaves_the_figures_of_before(made, told, cap
     told(figure(2.345, FLAT), figure(2.345, FLAT))
     capsys.readouterr()
     assert main(["scale", str(made)]) == 4
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert "map 1: no millimetres, shading hardly changes" in said and "keeps the figures that it had" in said
+    ended = capsys.readouterr()
+    assert "map 1: no millimetres, shading hardly changes" in ended.out
+    assert "keeps the figures that it had" in ended.err.splitlines()[-1]
     assert main(["scale", str(made), "-o", str(made.parent / "own"), "--overwrite"]) == 4
     for folder in (made / "scale", made.parent / "own"):
         assert (folder / "scale.json").read_text() == before and json.loads((folder / "run.json").read_text())
@@ -212,6 +213,34 @@ def test_a_scale_that_finds_nothing_leaves_the_figures_of_before(made, told, cap
     shutil.rmtree(made.parent / "own")
     assert main(["scale", str(made), "-o", str(made.parent / "own")]) == 4
     assert json.loads((made.parent / "own" / "scale.json").read_text())["maps"][0]["mm_per_unit"] is None
+
+
+def test_a_scale_that_replaces_other_figures_says_in_one_line_which(made, told, capsys):
+    told(figure(2.0), figure(3.0))
+    assert main(["scale", str(made)]) == 0 and "replaces the" not in capsys.readouterr().out
+    assert main(["scale", str(made)]) == 0 and "replaces the" not in capsys.readouterr().out  # by the same ones
+    told(figure(2.5), figure(3.0, FLAT))
+    assert main(["scale", str(made)]) == 0
+    line = "replaces the scale of before: map 0 had 2 mm per map unit, now 2.5; map 1 had 3 mm per map unit, now none"
+    assert line in capsys.readouterr().out.splitlines()
+    assert json.loads((made / "scale" / "run.json").read_text())["replaced"] == {"0": 2.0, "1": 3.0}
+
+
+def test_both_refusals_of_a_scale_have_one_form_and_a_question_is_no_end_of_a_sentence(made, told, capsys):
+    """The first folder has no figures, the second has some that it keeps."""
+    elsewhere = "the light shines from elsewhere: the images put it 30 degrees around the axis from its place"
+    refused_twice = figure(2.345, elsewhere), figure(2.345, FLAT)
+    why = f"no map has a scale; map 0: no millimetres, {elsewhere}; check position_mm in light.json: is it this "
+    why += "endoscope's, in camera axes?"
+    for ending in ("has the reason of each map", "keeps the figures that it had"):
+        told(*refused_twice)
+        capsys.readouterr()
+        assert main(["scale", str(made)]) == 4
+        ended = capsys.readouterr()
+        assert ended.err.splitlines()[-1] == f"lightdepth scale: {why} {made / 'scale'} {ending}"
+        assert ended.out.splitlines()[0].startswith(f"map 1: no millimetres, {FLAT}")
+        told(figure(2.0), figure(3.0))
+        assert main(["scale", str(made)]) == 0
 
 
 def test_the_reason_of_a_run_of_one_map_is_told_once(tmp_path, told, capsys):
@@ -245,6 +274,24 @@ def test_what_the_light_really_refuses_reaches_the_user(light, why, tmp_path, ca
     assert why in ended.out + ended.err
     (one,) = json.loads((run / "scale" / "scale.json").read_text())["maps"]
     assert (one["mm_per_unit"], one["interval"]) == (None, None) and one["cure"]
+
+
+def test_a_light_that_is_refused_beside_a_length_is_told_in_the_file_and_on_the_terminal(made, capsys):
+    argv = ["--length.ends", "[[0, 0, 5], [0, 3, 9]]", "--length.mm", "10", "--length.map", "1"]
+    assert main(["scale", str(made), "--light", "gamma=2.2,mu=0", *argv]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("map 1: 2 mm per map unit")]
+    assert "by a known length; the light tells none, the light is said to sit in the camera" in line
+    assert line.endswith("say in light.json where it sits: position_mm, in camera axes")
+    file = made / "scale" / "scale.json"
+    record = json.loads(file.read_text())
+    one = record["maps"][1]
+    assert one["refused"] == "" and "sit in the camera" in one["light_refused"] and "position_mm" in one["cure"]
+    assert scale_of(made, 1) == MapScale(**one | {"interval": tuple(one["interval"])})
+    for each in record["maps"]:
+        del each["light_refused"]  # as earlier versions wrote it
+    file.write_text(json.dumps(record))
+    found = scale_of(made, 1)
+    assert found is not None and found.mm_per_unit == 2 and found.light_refused == ""
 
 
 def test_a_given_light_wins_and_a_length_tells_its_map_where_the_light_tells_none(made, capsys):

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from test_judging import known
 from test_scale import LIGHT, dense_map, frames
 
 from densify import densified
@@ -49,10 +50,25 @@ def test_densify_writes_millimetres_where_every_map_has_them_and_says_so(tmp_pat
 def test_where_one_map_is_refused_all_surfaces_stay_in_map_units(tmp_path, monkeypatch, capsys):
     scales = Scales((MapScale(0, 2.0, (1.6, 2.5), "the light"), MapScale(1, refused="it is dark", cure="more light")))
     work, record = densified_in(tmp_path / "run", scales, monkeypatch)
-    assert record["unit"] == "map units" and work.of_millimetres == ""
+    assert record["unit"] == "map units"
+    assert work.of_millimetres == "the surfaces are in map units, as the light tells no millimetres"
+    why = "the surfaces are in map units: the light tells no millimetres of map 1: it is dark; more light"
+    assert work.without_millimetres == why
     np.testing.assert_allclose(np.abs(trimesh.load(tmp_path / "run" / "map_000" / "mesh.ply").bounds), 10, rtol=0.01)
     said = capsys.readouterr().out
-    assert "warning: map 1: no millimetres, it is dark; more light" in said and "stay in map units" in said
+    assert "warning: map 1: no millimetres, it is dark; more light" in said
+
+
+def test_the_verdict_says_that_surfaces_are_in_map_units_where_millimetres_were_asked_for():
+    result = SubmapResult(dense_map(0), known(), 0.0, {})
+    gallery = Gallery(SparseMap((result.dense.submap,), "maps"))
+    asked = Densified(
+        "truth", [result], gallery, scales=Scales((MapScale(0, refused="it is dark", cure="more light"),))
+    )
+    assert asked.verdict is not None
+    for said in (asked.headline, asked.verdict.sentence):
+        assert said.endswith("; the surfaces are in map units, as the light tells no millimetres")
+    assert "map units" not in Densified("truth", [result], gallery).headline
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,9 @@ from lightdepth.errors import InputError
 from lightdepth.files.reading import reading
 from lightdepth.reporting.progress import counted_through
 from lightdepth.reporting.same import plain
+
+_MOST_NAMED = 10
+"""Groups of copies that a warning names."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,24 @@ def units_of(rows: Iterable[Row], asked: Asked) -> list[Unit]:
         name = called if taken[called] == 1 else f"{called}-{taken[called]}"
         units.append(Unit(name, row, own, extent, trouble))
     return units
+
+
+def said_of_copies(units: Iterable[Unit], called: Callable[[Unit], str]) -> str:
+    """Which units have the same frames although these lie at several places, in a sentence that names them as `called`
+    does; empty where there are none. Digits of names and of some contents tell: no frame is read for it."""
+    same: dict[str, dict[str, Unit]] = {}
+    for unit in units:
+        if unit.extent is not None:
+            same.setdefault(unit.extent.digits, {}).setdefault(os.path.abspath(unit.row.data), unit)
+    groups = [list(each.values()) for each in same.values() if len(each) > 1]
+    if not groups:
+        return ""
+    count = sum(len(group) - 1 for group in groups)
+    named = "; ".join(" and ".join(map(called, group)) for group in groups[:_MOST_NAMED])
+    more = "; ..." if len(groups) > _MOST_NAMED else ""
+    has = "sequence has" if count == 1 else "sequences have"
+    told = "as the names of all frames and the contents of some tell"
+    return f"{count} {has} the same frames as another one, {told}, and each counts as its own: {named}{more}"
 
 
 def share_of(units: Sequence[Unit], share: tuple[int, int]) -> list[Unit]:

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from densify.bench.scenes import SUITE_VERSION
 from densify.bench.work import INLIERS, SPARSE, BenchConfig
 from densify.evaluation.tables import Table
+from lightdepth.counting import full_stop
 from lightdepth.errors import InputError
 from lightdepth.files.schema import checked_fields, read_json
 from lightdepth.reporting.record import git_revision, versions
@@ -201,5 +202,5 @@ def notes(found: Mapping[str, Any]) -> list[str]:
         for name, row in cell["rows"].items():
             if "error" in row:
                 place = cell.get("case") or f"{cell['wrong_share']:.0%} wrong"
-                said.append(f"{cell['scene']}, {place}, {name}: {row['error']}.")
+                said.append(full_stop(f"{cell['scene']}, {place}, {name}: {row['error']}"))
     return said

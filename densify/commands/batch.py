@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
@@ -9,7 +10,7 @@ from shlex import quote
 from densify.batch.folder import PAGE, real_place
 from densify.batch.make import Maker
 from densify.batch.manifest import read_manifest
-from densify.batch.units import check_contents_of_all, check_files_of_all, units_of
+from densify.batch.units import check_contents_of_all, check_files_of_all, said_of_copies, units_of
 from densify.batch.work import Batch, Running, batch_run, check_running, told_failures
 from densify.config import DensifyConfig
 from densify.dense_run import Asked
@@ -18,9 +19,10 @@ from densify.joining import MergeConfig
 from lightdepth.checkpoint import ModelSource
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
-from lightdepth.counting import counted
+from lightdepth.counting import counted, full_stop
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import PartialFailure
+from lightdepth.foreign_text import for_line
 from lightdepth.reporting.names import KEPT
 from lightdepth.reporting.run import recorded
 from lightdepth.sfm.config import SfmConfig
@@ -85,10 +87,13 @@ def batch(
     settings = recorded(source, predicting, config, files, sfm=sfm, fit_light=fit_light, merge=merge, merging=merging)
     arguments = {**settings, **vars(mapped), "map": inside, "data": None}
     same = [f"The manifest repeats {counted(len(rows) - len(units), 'row')}."] * (len(rows) > len(units))
+    if copies := said_of_copies(units, lambda unit: str(unit.row.data)):
+        print(for_line(f"warning: {copies}"), file=sys.stderr, flush=True)
+        same.append(full_stop(said_of_copies(units, lambda unit: unit.name)))  # files name no paths
     work = Batch(units, place, Maker(predicting, place, KEPT.get()), arguments, same)
     lines = batch_run(work, running)
     if failures := told_failures(lines):
         first = "; ".join(failures[:_MOST_NAMED]) + ("; ..." if len(failures) > _MOST_NAMED else "")
         said = f"{counted(len(failures), 'sequence')} of {len(lines)} failed: {first}"
-        raise PartialFailure(f"{said}. The rest is in {output}")
+        raise PartialFailure(f"{full_stop(said)} The rest is in {output}")
     end(output, then=f"cat {quote(str(output / 'table.csv'))}", page=output / PAGE)

@@ -7,7 +7,7 @@ from shlex import quote
 
 from densify.config import DensifyConfig
 from densify.evaluation.depth_files import DepthReading
-from densify.evaluation.files import write_evaluations
+from densify.evaluation.files import check_no_truth_lost, write_evaluations
 from densify.evaluation.in_short import in_short
 from densify.evaluation.judge import judge_gap
 from densify.evaluation.judged_map import read_run
@@ -47,7 +47,8 @@ def evaluate(
             poses.
         fit_light: With --checkpoint, where neither --light nor the truth's folder gives the light, fit it on each map,
             and use it if its depth fits hidden blocks of wall better; switched off, a usual light is assumed.
-        overwrite: Replace metrics made before (evaluation/ in a run is replaced without asking).
+        overwrite: Replace metrics made before. Without it, evaluation/ in a run is replaced too, unless that would
+            replace metrics against truth by metrics without.
     """
     folder = output or run / "evaluation"
     arguments = recorded(
@@ -67,6 +68,8 @@ def evaluate(
     first = dense_first(predicting, source, config, fit_light)
     gap = None if join is None else judge_gap(read_run(run), join)
     with run_folder(folder, "evaluate", arguments, overwrite or output is None) as out:
+        if source.truth is None and not overwrite:
+            check_no_truth_lost(folder)
         out.hash_inputs(truth=source.truth)
         answer = judge_asked(asked, first, out)
         sources = Sources(run, source.truth, gap, "" if first is None else str(first))

@@ -24,6 +24,7 @@ def view(
     mm_per_unit: Annotated[float | None, above(0)] = None,
     triangles: Annotated[int, at_least(100)] = TRIANGLES,
     rerun: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
     """A run in a browser: surfaces, points, cameras with their pictures, lengths between two clicks.
 
@@ -41,10 +42,15 @@ def view(
             show finer detail and take a browser longer.
         rerun: File, ending in .rrd, to write as a recording for the Rerun viewer (extra `rerun`), with the images,
             instead of opening a page. Left out, none is written.
+        overwrite: Replace a recording made before. Without it, one that is already there is refused.
     """
     if rerun is not None:
-        _record(run, data, mm_per_unit, triangles, rerun)
+        _record(run, data, mm_per_unit, triangles, rerun, overwrite)
         return
+    if overwrite:
+        raise InputError(
+            "--overwrite", "given without --rerun: nothing is written", "add --rerun FILE, or leave it out"
+        )
     try:
         from densify.viewing.work import Viewing
     except ModuleNotFoundError as error:
@@ -57,7 +63,9 @@ def view(
         received.stop("nothing was written")
 
 
-def _record(run: Path, data: Path | None, mm_per_unit: float | None, triangles: int, output: Path) -> None:
+def _record(
+    run: Path, data: Path | None, mm_per_unit: float | None, triangles: int, output: Path, overwrite: bool
+) -> None:
     """Writes a recording of the maps that there are now."""
     if output.suffix != ".rrd":
         raise InputError("--rerun", f"{output} does not end in .rrd", "the Rerun viewer opens no other files")
@@ -69,6 +77,8 @@ def _record(run: Path, data: Path | None, mm_per_unit: float | None, triangles: 
     from densify.viewing.watched import WatchedRun
 
     check_rewritable(output, BEGINNING, [run, data])
+    if output.exists() and not overwrite:
+        raise InputError(output, "already there", "choose another name, or give --overwrite")
     watched = WatchedRun(run, triangles)
     if not (maps := watched.first()):
         raise InputError(run, "no surface yet", "begin again when the run has finished its first map")

@@ -24,8 +24,11 @@ from densify.evaluation.records import (
 from densify.evaluation.suite import Suite
 from densify.evaluation.tables import Cell, notes_of, tables_of
 from densify.judging.withheld import WithheldOfMap
+from lightdepth.errors import InputError
+from lightdepth.files.schema import read_json
 from lightdepth.foreign_text import for_table
 
+METRICS = "metrics.json"
 CURVES = "cumulative_error"
 """Name of the files with cumulative error curves, after the sequence's where there are several."""
 
@@ -33,6 +36,17 @@ CURVES = "cumulative_error"
 def prefix_of(name: str, found: Mapping[str, object]) -> str:
     """What the names of a sequence's files begin with."""
     return f"{name}_" if len(found) > 1 else ""
+
+
+def check_no_truth_lost(folder: Path) -> None:
+    """Raises InputError where a folder, which metrics without truth would replace, has metrics against truth."""
+    try:
+        record = read_json(folder / METRICS)
+    except InputError:  # none, or spoilt: nothing is lost
+        return
+    if isinstance(record, Mapping) and record.get("truth_folder") is not None:
+        cure = "give --truth DATA again, another -o for metrics without truth, or --overwrite to lose those"
+        raise InputError(folder, "holds metrics against truth, which metrics without truth would replace", cure)
 
 
 def write_evaluations(
@@ -44,7 +58,7 @@ def write_evaluations(
 ) -> None:
     """Everything but a page, into the folder."""
     record = metrics_record(found, withheld, sources)
-    (folder / "metrics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    (folder / METRICS).write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     results = {name: e.judged for name, e in found.items()}
     tables, notes = tables_of(found, withheld, suite), notes_of(found, sources)
     text = "\n".join([*(t.markdown() for t in tables), *notes])

@@ -9,6 +9,7 @@ import numpy as np
 from densify.judging.ahead import Ahead, running
 from densify.live.play import Played
 from densify.scene import SURFACE_FILES
+from lightdepth.counting import full_stop
 from lightdepth.reporting.figures import chart, chart_png
 from lightdepth.reporting.report import Report
 from lightdepth.reporting.scene import Scene
@@ -32,7 +33,7 @@ def live_page(
     played and how long it took, `timings` the picture of that (PNG), `scene` the finished surfaces."""
     page = Report("Live surfaces")
     if verdict:
-        page.text(f"Verdict: {verdict}.")
+        page.text(full_stop(f"Verdict: {verdict}"))
     for note in notes:
         page.text(note)
     if scene is not None:
@@ -66,7 +67,7 @@ def _agreement(page: Report, judged: Mapping[int, Ahead], played: Sequence[Playe
     headers += ["pixels of the images", "surface from them"]
     page.table(headers, rows)
     for number, found in judged.items() if len(judged) > 1 else ():  # a single one is said above
-        page.text(f"Map {number}: {found.verdict}.")
+        page.text(full_stop(f"Map {number}: {found.verdict}"))
     page.wide_figures(
         [(_running_picture(judged, played), "The same while the surfaces grew: medians up to each keyframe")]
     )

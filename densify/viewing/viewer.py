@@ -21,7 +21,7 @@ from densify.viewing.pictures import Pictures
 from densify.viewing.places import CHOSEN, extent
 from densify.viewing.ruler import Place, Ruler
 from densify.viewing.watched import State, ViewedMap
-from lightdepth.counting import counted
+from lightdepth.counting import counted, full_stop
 from lightdepth.errors import InputError
 from lightdepth.reporting.scene import Surface
 
@@ -325,7 +325,7 @@ class Viewer:
         try:
             found = self._ruler.between(viewed, *(place.point for place in self._places))
         except InputError as error:
-            self.panel.measured.content = lines(f"{error.found}; {error.cure}.")
+            self.panel.measured.content = lines(full_stop(f"{error.found}; {error.cure}"))
             return
         unit, way = self.known.unit, found.found
         assert isinstance(way, Way)

@@ -19,6 +19,7 @@ from lightdepth.command_line.kinds import choices_of_type, expected, list_apart,
 from lightdepth.command_line.pages import Page
 from lightdepth.command_line.settings_yaml import read_settings
 from lightdepth.command_line.words import dashed, options, underscored
+from lightdepth.counting import full_stop
 from lightdepth.errors import WrongUsage
 from lightdepth.foreign_text import for_terminal
 from lightdepth.regular import regular
@@ -61,7 +62,7 @@ def one_line(parser: ArgumentParser, page: Page, argv: Sequence[str], message: s
         said = " ".join(message.split())
     everyday = not name or page.shows(name.lstrip("-").replace("-", "_"))
     shown = "--help" if everyday and "." not in name else "--help-all"
-    return f"{said}{'.' * (not said.endswith('?'))} Read on: {parser.prog} {shown}"
+    return f"{full_stop(said)} Read on: {parser.prog} {shown}"
 
 
 def _unknown(parser: ArgumentParser, word: str) -> tuple[str, str]:
@@ -105,9 +106,9 @@ def _typed(parser: ArgumentParser, dest: str) -> str:
 
 def _wrong_value(parser: ArgumentParser, argv: Sequence[str], key: str, message: str) -> str:
     action = next((a for a in options(parser) if a.dest == key), None)
-    given = re.search(r"(?:Got value|Given value): (.*?)\s*$", message, re.DOTALL | re.MULTILINE)
+    given = re.search(r"(?:Got value|Given value):(.*?)\s*$", message, re.DOTALL | re.MULTILINE)
     kind = getattr(action, "_typehint", None)
-    where, value = _file_with(argv, key) if not _on_line(argv, key) else "", given[1].strip() if given else ""
+    where, value = _file_with(argv, key) if not _on_line(argv, key) else "", (given[1].strip() or "''") if given else ""
     named = f"{key}:" if where or action is None or not action.option_strings else f"--{dashed(key)}"
     if kind is None or not value:
         return f"{where}{named} {' '.join(message.split())}"

@@ -16,7 +16,7 @@ from lightdepth.colour import ColourMeter
 from lightdepth.command_line.dry import Step
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
-from lightdepth.counting import counted
+from lightdepth.counting import counted, full_stop
 from lightdepth.datasets import FrameSequence, SequenceSource
 from lightdepth.depth_gate import DepthGate, sentence
 from lightdepth.errors import InputError
@@ -125,7 +125,7 @@ def predict(
             f"{len(frames) - len(run.record['failures'])} of {counted(len(frames), 'frame')} predicted by {model.name}"
         )
         run.log(made)
-        said = [f"{made}.", *(f"Warning: {warning}." for warning in run.record["warnings"])]
+        said = [f"{made}.", *(full_stop(f"Warning: {warning}") for warning in run.record["warnings"])]
         page = predicted_page(said, _facts(refine, factor, previews), _shown(run.folder, frames) if previews else [])
         page.files(run.folder, {})
         page.write(run.folder / "report.html")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lightdepth.counting import counted
+from lightdepth.counting import counted, full_stop
 from lightdepth.importing import findings as finding
 from lightdepth.importing.findings import Finding
 from lightdepth.importing.pictures import Geometry
@@ -25,7 +25,7 @@ def doubts(
     )
     doubt = "" if camera is None or camera.provenance is None else camera.provenance.doubt
     if doubt:
-        found.append(Finding(f"{doubt[0].upper()}{doubt[1:]}.", "A calibration of this endoscope is better."))
+        found.append(Finding(full_stop(f"{doubt[0].upper()}{doubt[1:]}"), "A calibration of this endoscope is better."))
     if source.light is None:
         found.append(
             Finding(

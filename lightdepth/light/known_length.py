@@ -52,8 +52,10 @@ class KnownLength:
         return self.error_mm / self.mm
 
     def alone(self, like: Millimetres) -> Millimetres:
-        """What the length tells by itself of its map, of which the light told something else or nothing."""
-        return replace(like, mm_per_unit=self.mm_per_unit, deviation=self.deviation, refused="", by=LENGTH)
+        """What the length tells by itself of its map, of which the light told something else or nothing, with the
+        reason for that."""
+        alone = replace(like, mm_per_unit=self.mm_per_unit, deviation=self.deviation, refused="", by=LENGTH)
+        return replace(alone, light_refused=like.refused)
 
 
 def weighed(found: Together, known: KnownLength) -> Together:

@@ -92,11 +92,13 @@ class Millimetres:
     """share by which the response's exponent is too large, as the images have it"""
     by: str = "the light"
     """what tells it"""
+    light_refused: str = ""
+    """why the light tells nothing, of a scale that something else tells"""
 
     @property
     def cure(self) -> str:
-        """What to do about a refusal; empty where there is none."""
-        return next((cure for why, cure in _CURES if why in self.refused), "")
+        """What to do about a refusal, of the light too; empty where there is none."""
+        return next((cure for why, cure in _CURES if why in (self.refused or self.light_refused)), "")
 
     @property
     def interval(self) -> tuple[float, float]:

@@ -32,6 +32,7 @@ from lightdepth.camera import (
     camera_of,
     opencv_camera,
 )
+from lightdepth.counting import full_stop
 from lightdepth.errors import InputError
 from lightdepth.files.reading import check_bytes, reading
 from lightdepth.files.rotations import pose_from_quaternion, quaternion_from_pose
@@ -263,7 +264,7 @@ class _Cameras:
             beside = self.path.parent / "camera.json"
             if not beside.is_file():
                 raise InputError(
-                    error.where, error.found, f"{error.cure}. Correct it, or put camera.json beside the map"
+                    error.where, error.found, f"{full_stop(error.cure)} Correct it, or put camera.json beside the map"
                 ) from error
             return self.convention.from_ours(read_camera(beside))
 

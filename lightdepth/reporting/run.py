@@ -17,7 +17,7 @@ from typing import Any, TextIO
 from lightdepth.command_line.dry import is_dry
 from lightdepth.command_line.outcome import outcome
 from lightdepth.command_line.warned import heard
-from lightdepth.counting import counted
+from lightdepth.counting import counted, full_stop
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.lock import locked
 from lightdepth.files.machine import machine_failure
@@ -299,8 +299,8 @@ def run_folder(
         cure = f"give a folder in it: -o {output / 'run'}" if real.is_dir() else "choose another -o"
         raise InputError(output, f"cannot be made ({error.strerror})", cure) from error
     if failures := run.record["failures"]:
-        first = f"the first: {failures[0]['what']}: {failures[0]['reason']}"
-        raise PartialFailure(f"{counted(len(failures), 'part')} failed, {first}. The rest is in {output}")
+        first = full_stop(f"the first: {failures[0]['what']}: {failures[0]['reason']}")
+        raise PartialFailure(f"{counted(len(failures), 'part')} failed, {first} The rest is in {output}")
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from shlex import quote
 from typing import Annotated
 
 from lightdepth.command_line.outcome import end, outcome
-from lightdepth.counting import counted
+from lightdepth.counting import counted, full_stop
 from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files import replacing
 from lightdepth.files.lock import locked
@@ -108,8 +108,8 @@ def ablate(
             replacing.replace(place, real, before)
     outcome().made(output)
     if failed:
-        first = f"{failed[0].row}: {failed[0].failed}"
-        raise PartialFailure(f"{counted(len(failed), 'training')} failed, the first: {first}. The rest is in {output}")
+        first = full_stop(f"{failed[0].row}: {failed[0].failed}")
+        raise PartialFailure(f"{counted(len(failed), 'training')} failed, the first: {first} The rest is in {output}")
     page = table or output / "ablation.md"
     end(*filter(None, (output, table)), then=f"cat {quote(str(page))}", page=page)
 

@@ -20,6 +20,7 @@ import numpy as np
 from lightdepth.command_line.following import Input, Value, command
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
+from lightdepth.counting import full_stop
 from lightdepth.datasets import FormatName, FrameSequence, SequenceSource
 from lightdepth.datasets.coloured import colours_of
 from lightdepth.datasets.with_map import open_with_map
@@ -338,7 +339,7 @@ def _page(
     page = Report("Frames worth training on")
     page.text(said)
     for doubt in doubts:
-        page.text(f"Warning: {doubt}.")
+        page.text(full_stop(f"Warning: {doubt}"))
     counts = Counter("kept" if v.kept else v.reason for v in verdicts)
     page.table(["", "frames", "share"], [[what, n, n / len(verdicts)] for what, n in counts.most_common()])
     if any(v.reason == "blur" for v in verdicts):

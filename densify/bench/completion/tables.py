@@ -15,6 +15,7 @@ from densify.bench.completion.work import DELIVERED
 from densify.bench.curves import BANDS_MM
 from densify.evaluation.records import SurfaceFigures
 from densify.evaluation.tables import Table
+from lightdepth.counting import full_stop
 
 VERSION = 1
 """Figures of two versions are not comparable."""
@@ -173,5 +174,5 @@ def notes(cells: Sequence[CellFigures]) -> list[str]:
         lacking = {name: row for name, row in cell.rows.items() if name not in METHODS}
         for name, row in lacking.items():
             if row.error:
-                said.append(f"{cell.scene}, {cell.errors}, {name}: {row.error}.")
+                said.append(full_stop(f"{cell.scene}, {cell.errors}, {name}: {row.error}"))
     return said
