@@ -1,4 +1,4 @@
-"""Numbers of things in words: one has no plural."""
+"""Things in words: one has no plural, and `an` before a vowel."""
 
 from __future__ import annotations
 
@@ -6,3 +6,8 @@ from __future__ import annotations
 def counted(count: int, thing: str, several: str = "") -> str:
     """`1 frame`, `2 frames`; `several` is the plural where it takes more than an s."""
     return f"{count} {thing if count == 1 else several or f'{thing}s'}"
+
+
+def with_article(thing: str) -> str:
+    """`a mask`, `an image`; before a u, `a`: ours are spoken as in `unet`, not as in `unfinished`."""
+    return f"{'an' if thing[:1].lower() in 'aeio' else 'a'} {thing}"
