@@ -30,7 +30,7 @@ from lightdepth.counting import counted
 from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.errors import InputError, Interrupted
 from lightdepth.files.named_inputs import write_inputs
-from lightdepth.files.replacing import output_of, read_record, unfinished_path
+from lightdepth.files.replacing import STATE, discard, output_of, read_record, unfinished_path
 from lightdepth.files.writing import sync_below, write_whole
 from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
@@ -158,6 +158,7 @@ def _fitted(
 ) -> dict[str, float]:
     started = time.monotonic()
     data.parted = bool(trainer_options.get("use_distributed_sampler", True))
+    data.read_colons(folder / STATE / "colons")
     _opened(data.setup)
     asked = {"settings": yaml.safe_load(job.config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
     output = output_of(folder) or folder
@@ -165,9 +166,11 @@ def _fitted(
     names = Names() if KEPT.get() else names_of(asked, (output, folder), argv=job.arguments, hashed=unread)
     echo = Echo(folder / "log.txt", names)
     before = settings_before(folder) if start is not None else None
+    unkept = ""
     if first_process():
         begin_in(folder)
         clear_cut_off(folder / "checkpoints")
+        unkept = data.keep_colons()
         settings = job.config_yaml
         if names.paths:
             write_inputs(folder, names.paths)
@@ -179,6 +182,8 @@ def _fitted(
     )
     for sentence in data.doubts:
         echo(f"warning: {sentence}")
+    if unkept:
+        echo(unkept)
     data.tell = partial(_warned, echo)
     checkpoints = folder / "checkpoints"
     with finishing_first() as received:
@@ -216,6 +221,7 @@ def _fitted(
         record = _exported(model, data, folder, chosen, errors, job, echo, shared, speed)
         if shows:
             echo(opening(trainer.logger, output))
+        discard(folder / STATE)  # nothing is gone on with: it would be a finished run's largest part
         sync_below(folder)  # run.json says that the rest is whole
         record["resumed"] = start is not None
         write_run_json(folder, "train", {"argv": names.command(job.arguments)}, started, record, names)

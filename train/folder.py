@@ -24,6 +24,7 @@ from lightdepth.files.named_inputs import INPUTS
 from lightdepth.files.replacing import (
     BEGUN,
     RECORD,
+    STATE,
     check_apart,
     check_replaceable,
     discard,
@@ -41,7 +42,7 @@ from .checkpoints import BEST, LAST, PREVIOUS
 
 _OURS = (
     *("config.yaml", "log.txt", "tensorboard", "csv", "checkpoints", "model.safetensors", "model.md", "report.html"),
-    *("uncertainty.png", INPUTS),
+    *("uncertainty.png", INPUTS, STATE),
 )
 """What a run writes, besides run.json and begun.json."""
 
