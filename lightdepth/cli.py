@@ -65,6 +65,7 @@ def _called(call: Outcome, given: list[str]) -> int:
     except Interrupted as error:
         with suppress(OSError):  # the terminal may be what is gone
             _say(f"lightdepth {call.verb}: {error}", flush=True)
+            _say_next(call)
         return 128 + error.signal
     except MachineFailure as error:  # of the terminal itself: what was to be said could not be
         with suppress(OSError):
@@ -138,7 +139,14 @@ def _told(verb: str, error: Exception | str, code: int) -> int:
     else:
         outcome().fail(verb, error)
     _say(f"lightdepth {verb}: {error}")
+    _say_next(outcome())
     return code
+
+
+def _say_next(call: Outcome) -> None:
+    """The command line that goes on with what is kept of a run which did not end."""
+    if call.again:
+        _say(f"next: {call.again}", flush=True)
 
 
 def _is_lost(verb: str) -> bool:

@@ -29,6 +29,7 @@ from numba.core.caching import (
     UserWideCacheLocator,
 )
 
+from lightdepth.command_line.heartbeat import compiles
 from lightdepth.native import open_to_others, user_cache
 
 
@@ -100,6 +101,11 @@ class _Kept(FunctionCache):
         self._cache_file = _Files(self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = self._loaded(sig, target_context)
+        compiles(id(self), begins=found is None)
+        return found
+
+    def _loaded(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
         except OSError:
@@ -110,6 +116,7 @@ class _Kept(FunctionCache):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
+        compiles(id(self), begins=False)
         for _ in range(2):
             try:
                 super().save_overload(sig, data)

@@ -1,4 +1,4 @@
-"""Words that hang on what they stand beside: a plural on its number, a full stop on how a sentence ends."""
+"""Words that hang on what they stand beside: a plural on its number, an article and a full stop on their letters."""
 
 from __future__ import annotations
 
@@ -11,3 +11,8 @@ def counted(count: int, thing: str, several: str = "") -> str:
 def full_stop(text: str) -> str:
     """The text as a sentence, with a full stop unless it ends as one already: a cure may be a question."""
     return text if text.endswith((".", "?", "!", "…")) else f"{text}."
+
+
+def with_article(thing: str) -> str:
+    """`a mask`, `an image`; before a u, `a`: ours are spoken as in `unet`, not as in `unfinished`."""
+    return f"{'an' if thing[:1].lower() in 'aeio' else 'a'} {thing}"

@@ -6,8 +6,10 @@ import atexit
 import ctypes
 import os
 import shutil
+import signal
 import stat
 import tempfile
+import threading
 from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
@@ -64,10 +66,15 @@ def open3d() -> ModuleType:
 
 @cache
 def pycolmap() -> ModuleType:
-    """The pycolmap module. cv2 comes first: two copies of zlib otherwise abort the process at the first PNG written."""
+    """The pycolmap module. cv2 comes first: two copies of zlib otherwise abort the process at the first PNG written.
+
+    It takes SIGTERM for a crash: a trace of the stack, and the end. Who had it before gets it back."""
     import cv2  # noqa: F401
     import pycolmap
 
+    before = signal.getsignal(signal.SIGTERM)  # as Python knows it, which was not asked
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
     pycolmap.logging.minloglevel = 2
     return pycolmap
 

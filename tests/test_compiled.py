@@ -28,6 +28,18 @@ def test_machine_code_is_kept_where_the_user_wants_it(tmp_path, monkeypatch):
     assert [p.suffix for p in sorted(tmp_path.rglob("*twice*"))] == [".nbc", ".nbi"]
 
 
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="Numba is off, to count lines")
+def test_a_loop_is_told_of_while_it_is_compiled_and_not_while_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
+    told: list[bool] = []
+    monkeypatch.setattr(module, "compiles", lambda loop, begins: told.append(begins))
+    compiled(twice)(np.arange(3))
+    assert told == [True, False]
+    told.clear()
+    compiled(twice)(np.arange(3))
+    assert told == [False]
+
+
 def test_where_nothing_can_be_written_each_process_makes_its_own(monkeypatch):
     monkeypatch.setattr(module._Place, "_locator_classes", [])  # none of the places can be written
     assert compiled(twice)(np.arange(3.0)).tolist() == [0, 2, 4]

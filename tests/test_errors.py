@@ -5,12 +5,15 @@ from __future__ import annotations
 import ast
 import copy
 import pickle
+import re
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from raising import refused
 
 from lightdepth.errors import InputError
+from lightdepth.files.reading import check_bytes
 
 ROOT = Path(__file__).parents[1]
 
@@ -71,3 +74,31 @@ def test_an_error_comes_back_from_another_process_and_from_a_copy():
     for other in (pickle.loads(pickle.dumps(error)), copy.copy(error), copy.deepcopy(error)):
         assert type(other) is InputError and str(other) == str(error)
         assert (other.where, other.found, other.cure) == ("seq: a.png", "0 bytes", "copy it again")
+
+
+_NO_VOWEL = {"config.kind", "MAPS", "RECORD", "self.kind", "a"}
+"""What stands behind a written `a` and never begins with a vowel that is heard as one: kinds of networks (`a unet`) and
+of boards, names of ours, and a title's own letter."""
+
+
+def written_articles(source: str) -> set[str]:
+    """The values that texts put behind an `a` or `an` of their own, whatever they begin with."""
+    found = set()
+    for text in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.JoinedStr)):
+        for before, value in pairwise(text.values):
+            words = str(before.value) if isinstance(before, ast.Constant) else ""
+            if isinstance(value, ast.FormattedValue) and re.search(r"(^|[^\w'])an? $", words, re.IGNORECASE):
+                found.add(ast.unparse(value.value))
+    return found
+
+
+def test_no_text_writes_an_article_before_a_value_that_it_may_not_fit():
+    packages = [ROOT / package for package in ("lightdepth", "densify", "train")]
+    found = {name for at in packages for path in at.rglob("*.py") for name in written_articles(path.read_text())}
+    assert found <= _NO_VOWEL, found - _NO_VOWEL
+
+
+def test_a_file_that_is_too_large_is_told_of_with_the_article_of_its_kind():
+    for what, said in (("image", "an image"), ("mask", "a mask")):
+        with refused(cure=f"expected {said} of at most 1 bytes"):
+            check_bytes(2, 1, "x.png", what)

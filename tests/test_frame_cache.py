@@ -168,7 +168,7 @@ def test_camera_light_and_mask_that_are_given_size_and_code_keep_frames_of_their
     given = {"light": str(tmp_path / "light.json")}
     assert same(batches(module(sequence, tmp_path / "kept", **given)), batches(module(sequence, **given)))
     there = len(kept(tmp_path / "kept"))
-    monkeypatch.setattr(frame_cache, "_code", lambda: "another version")
+    monkeypatch.setattr(frame_cache, "code_hash", lambda: "another version")
     batches(module(sequence, tmp_path / "kept"))
     assert len(kept(tmp_path / "kept")) == there + COUNT
 

@@ -59,7 +59,16 @@ def test_a_verb_that_has_said_something_is_no_longer_starting(clock):
     verb.say("a line of its own")
     verb.works(11)
     assert ["starting" in line for line in verb.lines] == [True, True, False, False]
-    assert ["compile" in line for line in verb.lines[:2]] == [True, False]  # the reason is said once
+
+
+def test_only_a_verb_that_compiles_loops_says_so_and_once(clock):
+    verb = Verb(clock)
+    verb.works(11)
+    heartbeat.compiles(1, begins=True)
+    verb.works(20)
+    heartbeat.compiles(1, begins=False)
+    verb.works(10)
+    assert ["it compiles loops" in line for line in verb.lines] == [False, True, False, False]
 
 
 def test_a_long_line_of_the_log_is_named_by_its_beginning(clock):

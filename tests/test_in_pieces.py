@@ -11,7 +11,7 @@ SCRIPT = Path(__file__).resolve().parents[1] / "train" / "in_pieces.sh"
 # It needs two calls of each seed, as a training does that outlasts the first.
 PROGRAM = """#!/bin/sh
 while [ "$1" != -o ]; do shift; done
-mkdir -p "$2/checkpoints"
+mkdir -p "$2/checkpoints" "$2/.state/colons"
 if [ -f "$2/checkpoints/last.ckpt" ]; then echo {} > "$2/run.json"; exit 0; fi
 echo half > "$2/checkpoints/last.ckpt"
 exit 143
@@ -40,4 +40,4 @@ def test_calls_go_on_from_what_the_one_before_packed_until_all_seeds_are_done(tm
     with tarfile.open(tmp_path / "runs.tar.gz") as packed:
         names = packed.getnames()
     assert {"runs/both-1/run.json", "runs/both-2/run.json"} <= set(names)
-    assert not [name for name in names if "checkpoints" in name]
+    assert not [name for name in names if "checkpoints" in name or ".state" in name]

@@ -20,6 +20,15 @@ def test_cv2_is_imported_before_pycolmap():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_pycolmap_leaves_sigterm_to_whoever_had_it():
+    code = (
+        "import signal; from lightdepth import native; heard = [];"
+        "signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number));"
+        "native.pycolmap(); signal.raise_signal(signal.SIGTERM); assert heard == [signal.SIGTERM]"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_importing_the_module_imports_none_of_the_heavy_ones():
     code = (
         "import sys; import lightdepth.native;"

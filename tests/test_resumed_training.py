@@ -271,7 +271,7 @@ def test_a_job_that_slurm_warns_saves_itself_asks_for_another_start_and_goes_on_
         os.killpg(process.pid, number)
     error = process.communicate(timeout=120)[1]
     assert process.returncode in (128 + signal.SIGUSR1, 128 + signal.SIGTERM), error
-    said = error.strip().splitlines()[-1]
+    said = next(line for line in reversed(error.splitlines()) if not line.startswith("next: "))
     assert said.startswith("lightdepth train: stopped by SIG") and "--resume goes on" in said
     start = newest(tmp_path / "run" / "checkpoints")
     assert start.step >= 5 and f"step {start.step} is kept" in said

@@ -195,9 +195,8 @@ class Checkpoints(pl.Callback):
         if step and step != self._saved and (stop or step % self.every == 0):
             self._save(trainer)
         if stop:
-            kept = f"step {step} is kept in {LAST}: --resume goes on" if step else "no step was made yet"
             self.received.signal = self.received.signal or signal.SIGTERM  # another process was told
-            self.received.stop(kept)
+            self.received.stop(f"step {step} is kept in {LAST}" if step else "")
 
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self.monitor is None or trainer.state.fn != "fit" or trainer.sanity_checking:

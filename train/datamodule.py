@@ -31,6 +31,7 @@ from train.colons import SceneMaker, TubeData, colon_seeds, tube_scene, val_scen
 from train.frame_cache import FrameCache, cache_root, check_outside
 from train.frame_lists import Listed, listed_rows, open_listed
 from train.frame_sets import Frames, Opened, Rendered, held_out_count
+from train.kept_colons import KeptColons
 from train.loader import Waited, loader
 from train.order import ALONE, Halves, Parted, Place, Shuffled
 
@@ -145,6 +146,8 @@ class FrameDataModule(pl.LightningDataModule):
         self._sources: dict[str, SequenceSource] = {}
         self._unkept: list[str] = []
         self._waited = Waited()
+        self._kept: KeptColons | None = None
+        self._rendered: list[tuple[int, list[FrameBatch]]] = []  # colons by seed that are not kept yet
         check_apart(self.sequences, self.val_sequences)
         self._train: ConcatDataset[FrameBatch] | None = None
         self._val: ConcatDataset[FrameBatch] | None = None
@@ -153,6 +156,15 @@ class FrameDataModule(pl.LightningDataModule):
     def go_on(self, epoch: int, batch: int) -> None:
         """A run that is resumed begins with this batch of this epoch."""
         self._begun = epoch, batch
+
+    def read_colons(self, root: Path) -> None:
+        """`setup` takes colons from the folder `root` that were kept there, in the place of rendering them."""
+        self._kept = KeptColons(root, self.tube, self.config.seed, self.size)
+
+    def keep_colons(self) -> str:
+        """Keeps the colons that `setup` rendered where it looked for them. Returns a sentence on those that are not."""
+        rendered, self._rendered = self._rendered, []
+        return self._kept.write(rendered) if self._kept is not None and rendered else ""
 
     def setup(self, stage: str | None = None) -> None:
         if self._train is not None:
@@ -163,7 +175,9 @@ class FrameDataModule(pl.LightningDataModule):
         train: list[Dataset[FrameBatch]] = [*opened.train]
         val: list[Dataset[FrameBatch]] = [*opened.val]
         if self.tube.scenes + self.tube.val_scenes > 0:
-            with Progress("Rendering synthetic colons", self.tube.scenes + self.tube.val_scenes) as bar:
+            there = self._kept is not None and self._kept.folder.is_dir()
+            told = "Reading rendered colons" if there else "Rendering synthetic colons"
+            with Progress(told, self.tube.scenes + self.tube.val_scenes) as bar:
                 to_train_on, to_validate_on = colon_seeds(self.tube, self.config.seed)
                 train += self._colons(tube_scene, to_train_on, bar)
                 val += self._colons(val_scene, to_validate_on, bar)
@@ -290,7 +304,10 @@ class FrameDataModule(pl.LightningDataModule):
     def _colons(self, make: SceneMaker, seeds: range, bar: Progress) -> list[Dataset[FrameBatch]]:
         made: list[Dataset[FrameBatch]] = []
         for i, seed in enumerate(seeds):
-            frames = make(self.tube, seed, i, self.size)
+            frames = self._kept.frames(seed) if self._kept is not None else None
+            if frames is None:
+                frames = make(self.tube, seed, i, self.size)
+                self._rendered += [(seed, frames)] if self._kept is not None else []
             made.append(Rendered(frames, [f"colon {seed} frame {k}" for k in range(len(frames))]))
             bar.advance()
         return made

@@ -25,11 +25,12 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from lightdepth.checkpoint import load_model, save_model
 from lightdepth.command_line.dry import is_dry
+from lightdepth.command_line.outcome import outcome
 from lightdepth.counting import counted
 from lightdepth.datasets.no_camera import NoCamera
 from lightdepth.errors import InputError, Interrupted
 from lightdepth.files.named_inputs import write_inputs
-from lightdepth.files.replacing import output_of, read_record, unfinished_path
+from lightdepth.files.replacing import STATE, discard, output_of, read_record, unfinished_path
 from lightdepth.files.writing import sync_below, write_whole
 from lightdepth.models import NetworkModel
 from lightdepth.module import LightDepth
@@ -51,7 +52,7 @@ from .datamodule import FrameDataModule, warn
 from .folder import begin_in, first_process, has_checkpoint, training_folder
 from .going_on import settings_before, warn_of_length, warn_of_settings
 from .report import FILES, show_frames, training_page
-from .requeue import requeued
+from .requeue import QUEUED, requeued
 from .running import NO_ROOT, while_training
 from .together import ending_together, look_after_each_other
 from .trained_card import TrainedCard, shared_by, trained_on
@@ -102,8 +103,10 @@ def fit(
             start = newest(folder / "checkpoints") if resume else None
             return _fitted(model, data, folder, trainer_options, job, start)
     except Interrupted as error:
-        left = error.kept or _left(output, resume or overwrite)
-        error.kept = ". ".join(filter(None, (left, requeued(error.signal))))
+        asked = requeued(error.signal)
+        error.kept = ". ".join(filter(None, (_left(output, resume or overwrite, error.kept), asked)))
+        if asked.endswith(QUEUED) or not first_process():
+            outcome().again = ""
         raise
 
 
@@ -155,6 +158,7 @@ def _fitted(
 ) -> dict[str, float]:
     started = time.monotonic()
     data.parted = bool(trainer_options.get("use_distributed_sampler", True))
+    data.read_colons(folder / STATE / "colons")
     _opened(data.setup)
     asked = {"settings": yaml.safe_load(job.config_yaml), "sequences": [*data.sequences, *data.val_sequences]}
     output = output_of(folder) or folder
@@ -162,9 +166,11 @@ def _fitted(
     names = Names() if KEPT.get() else names_of(asked, (output, folder), argv=job.arguments, hashed=unread)
     echo = Echo(folder / "log.txt", names)
     before = settings_before(folder) if start is not None else None
+    unkept = ""
     if first_process():
         begin_in(folder)
         clear_cut_off(folder / "checkpoints")
+        unkept = data.keep_colons()
         settings = job.config_yaml
         if names.paths:
             write_inputs(folder, names.paths)
@@ -176,6 +182,8 @@ def _fitted(
     )
     for sentence in data.doubts:
         echo(f"warning: {sentence}")
+    if unkept:
+        echo(unkept)
     data.tell = partial(_warned, echo)
     checkpoints = folder / "checkpoints"
     with finishing_first() as received:
@@ -196,7 +204,7 @@ def _fitted(
             path = None if start is None else start.path
             trainer.fit(model, datamodule=data, ckpt_path=path, weights_only=True)
         train_loss = trainer.callback_metrics.get("train/loss")
-        received.stop(f"all steps are kept in {LAST}: --resume exports the model")
+        received.stop(f"all steps are kept in {LAST}, and the model is not exported yet")
 
     chosen = exported_of(checkpoints, job.settings.monitor != "last")
     with ending_together(trainer):
@@ -213,6 +221,7 @@ def _fitted(
         record = _exported(model, data, folder, chosen, errors, job, echo, shared, speed)
         if shows:
             echo(opening(trainer.logger, output))
+        discard(folder / STATE)  # nothing is gone on with: it would be a finished run's largest part
         sync_below(folder)  # run.json says that the rest is whole
         record["resumed"] = start is not None
         write_run_json(folder, "train", {"argv": names.command(job.arguments)}, started, record, names)
@@ -288,11 +297,12 @@ def _warned(echo: Echo, sentence: str) -> None:
         warn(sentence)
 
 
-def _left(output: Path, flagged: bool) -> str:
-    """What is left of a run that was stopped outside its steps, and how to go on."""
+def _left(output: Path, flagged: bool, kept: str) -> str:
+    """What is left of a run that was stopped, and how to go on; `kept` is what its steps say of it."""
     if has_checkpoint(unfinished_path(output.resolve())) or (has_checkpoint(output) and read_record(output) is None):
-        return "its checkpoints are kept: --resume goes on"
-    return f"no step was made yet; {output.name} is as it was" if flagged else "no step was made yet"
+        return outcome().keeping(kept or "its checkpoints are kept")
+    none = f"{output.name} is as it was: the same command" if flagged else "nothing is kept: the same command"
+    return f"no step was made yet, so {none} starts anew"
 
 
 @contextmanager

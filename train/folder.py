@@ -16,13 +16,15 @@ from pathlib import Path
 
 from lightning.pytorch.utilities import rank_zero_only
 
-from lightdepth.errors import InputError
+from lightdepth.command_line.outcome import outcome
+from lightdepth.errors import InputError, PartialFailure
 from lightdepth.files.lock import locked
 from lightdepth.files.machine import machine_failure
 from lightdepth.files.named_inputs import INPUTS
 from lightdepth.files.replacing import (
     BEGUN,
     RECORD,
+    STATE,
     check_apart,
     check_replaceable,
     discard,
@@ -40,7 +42,7 @@ from .checkpoints import BEST, LAST, PREVIOUS
 
 _OURS = (
     *("config.yaml", "log.txt", "tensorboard", "csv", "checkpoints", "model.safetensors", "model.md", "report.html"),
-    *("uncertainty.png", INPUTS),
+    *("uncertainty.png", INPUTS, STATE),
 )
 """What a run writes, besides run.json and begun.json."""
 
@@ -148,7 +150,8 @@ def _kept_or_gone(folder: Path, output: Path, hidden: bool) -> Iterator[None]:
         kept = has_checkpoint(folder)
         named = str(getattr(error, "filename", ""))
         begun = folder.is_dir() or (isinstance(error, FileNotFoundError) and Path(named).is_relative_to(folder))
-        left = "Its checkpoints are kept: --resume goes on" if kept else "Nothing of it is kept"
+        resumable = kept and not isinstance(error, InputError | PartialFailure)
+        left = outcome().keeping("Its checkpoints are kept") if resumable else "Nothing of it is kept"
         failure = machine_failure(error, folder if begun else None, left, output)
         if not kept and hidden:
             discard(folder)

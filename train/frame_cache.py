@@ -43,6 +43,7 @@ UNUSED_S = 30 * 24 * 3600.0
 _USED = "used"
 _SUFFIX = ".safetensors"
 _DECODERS = ("numpy", "scipy", "opencv-python-headless", "av", "pillow", "torch", "pydicom", "OpenEXR")
+_RENDERERS = ("numba", "warp-lang")
 
 
 def cache_root(asked: bool | str) -> Path | None:
@@ -68,39 +69,12 @@ def check_outside(root: Path, sequences: Sequence[str]) -> None:
             raise InputError(root, f"lies in {path}, whose frames it is to keep", "choose another --data.cache")
 
 
-class FrameCache:
-    """The frames of one sequence at one size. `number` is a frame's own."""
+class KeptFrames:
+    """Batches of frames in a folder, by number: given back to the bit, or not at all. `said` of what is kept where."""
 
-    def __init__(self, root: Path, source: SequenceSource, size: tuple[int, int], first: FrameBatch) -> None:
-        """`first` is a frame of it: it tells of cameras, lights and masks that lie elsewhere."""
-        seen = _Record.of(first)
-        common = {name: value for name, value in seen.tensors.items() if name == "mask" or name.startswith("light.")}
-        state = _hash(state_of(source), _Record(common, seen.rays).sum)
-        self.folder = root / _hash(identity_of(source), size, _code())[:16] / state[:32]
-        self.bytes = len(seen.bytes())
+    def __init__(self, folder: Path, said: str) -> None:
+        self.folder, self.said = folder, said
         self._full = False
-
-    def prepare(self, frames: int) -> str:
-        """Makes the folder, clears what no one needs, and returns a sentence on what will not be kept of so many
-        frames; empty where all are."""
-        try:
-            self._make()
-            write_remade(self.folder / _USED, b"")
-        except OSError as error:
-            self._full = True
-            return f"decoded frames are not kept in --data.cache, which cannot be written ({error.strerror or error})"
-        there, free = 0, 0
-        with suppress(OSError):  # another process clears it, because the sequence has changed once more
-            _tidy(self.folder)
-            there = sum(1 for file in self.folder.iterdir() if file.stem.isdecimal())
-            free = max(0, shutil.disk_usage(self.folder).free - ROOM)
-        missing = (frames - there) * self.bytes
-        if free < missing:
-            return (
-                f"{missing / 1e9:.3g} GB of decoded frames do not fit into the {free / 1e9:.3g} GB "
-                f"that --data.cache may fill ({ROOM / 1e9:.0f} GB stay free): those that do not are decoded each time"
-            )
-        return ""
 
     def read(self, number: int) -> FrameBatch | None:
         """A frame, or None where it is not there, or not whole."""
@@ -124,6 +98,8 @@ class FrameCache:
             if shutil.disk_usage(self.folder).free < ROOM:
                 return
             try:
+                if not rays.is_file():  # of a folder of this name that was cleared, they may be in memory
+                    raise FileNotFoundError(rays)
                 _shared(rays)
             except (OSError, SafetensorError, KeyError, ValueError):
                 write_remade(rays, _Record({"rays": batch.rays}).bytes())
@@ -131,7 +107,7 @@ class FrameCache:
         except OSError as error:
             self._full = True
             warnings.warn(
-                f"no more decoded frames are kept in --data.cache ({error.strerror or error})",
+                f"no more {self.said} ({error.strerror or error})",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -142,6 +118,41 @@ class FrameCache:
         if not root.is_dir():
             root.mkdir(0o700, parents=True, exist_ok=True)
         self.folder.mkdir(parents=True, exist_ok=True)
+
+
+class FrameCache(KeptFrames):
+    """The frames of one sequence at one size. `number` is a frame's own."""
+
+    def __init__(self, root: Path, source: SequenceSource, size: tuple[int, int], first: FrameBatch) -> None:
+        """`first` is a frame of it: it tells of cameras, lights and masks that lie elsewhere."""
+        seen = _Record.of(first)
+        common = {name: value for name, value in seen.tensors.items() if name == "mask" or name.startswith("light.")}
+        state = _hash(state_of(source), _Record(common, seen.rays).sum)
+        folder = root / _hash(identity_of(source), size, code_hash())[:16] / state[:32]
+        super().__init__(folder, "decoded frames are kept in --data.cache")
+        self.bytes = len(seen.bytes())
+
+    def prepare(self, frames: int) -> str:
+        """Makes the folder, clears what no one needs, and returns a sentence on what will not be kept of so many
+        frames; empty where all are."""
+        try:
+            self._make()
+            write_remade(self.folder / _USED, b"")
+        except OSError as error:
+            self._full = True
+            return f"decoded frames are not kept in --data.cache, which cannot be written ({error.strerror or error})"
+        there, free = 0, 0
+        with suppress(OSError):  # another process clears it, because the sequence has changed once more
+            _tidy(self.folder)
+            there = sum(1 for file in self.folder.iterdir() if file.stem.isdecimal())
+            free = max(0, shutil.disk_usage(self.folder).free - ROOM)
+        missing = (frames - there) * self.bytes
+        if free < missing:
+            return (
+                f"{missing / 1e9:.3g} GB of decoded frames do not fit into the {free / 1e9:.3g} GB "
+                f"that --data.cache may fill ({ROOM / 1e9:.0f} GB stay free): those that do not are decoded each time"
+            )
+        return ""
 
 
 class _Record:
@@ -220,13 +231,13 @@ def _hash(*parts: object) -> str:
 
 
 @cache
-def _code() -> str:
-    """What decodes: this program's own code, and the versions of what it calls."""
+def code_hash() -> str:
+    """What decodes and renders: this program's own code, and the versions of what it calls."""
     found = hashlib.sha256()
     home = Path(lightdepth.__file__).parent
     for file in sorted(home.rglob("*.py")):
         found.update(file.relative_to(home).as_posix().encode() + b"\0" + file.read_bytes())
-    for name in _DECODERS:
+    for name in (*_DECODERS, *_RENDERERS):
         with suppress(metadata.PackageNotFoundError):
             found.update(f"{name} {metadata.version(name)}\n".encode())
     return found.hexdigest()

@@ -20,12 +20,12 @@ ends=$((SECONDS + ${CALL:-540}))
 mkdir -p "$folder"
 
 pack() { # the newest checkpoint is enough to go on from, and a run that is whole needs none
-    local unneeded=()
+    local unneeded=() # rendered colons (.state) are made anew
     for run in "$folder"/*; do
         [ -f "$run/run.json" ] && unneeded+=("--exclude=$(basename "$folder")/$(basename "$run")/checkpoints")
     done
     tar -czf "$folder.tar.gz.new" -C "$(dirname "$folder")" "${unneeded[@]}" --exclude=last-previous.ckpt \
-        --exclude=best.ckpt "$(basename "$folder")" && mv "$folder.tar.gz.new" "$folder.tar.gz"
+        --exclude=best.ckpt --exclude=.state "$(basename "$folder")" && mv "$folder.tar.gz.new" "$folder.tar.gz"
 }
 
 piece() { # the rest of one run, or as much of it as the call has time for

@@ -9,6 +9,7 @@ import subprocess
 
 _INTERACTIVE = ("bash", "interactive")
 """Names that Slurm gives the jobs of people at a terminal; Lightning looks at the same."""
+QUEUED = "is in the queue again"
 
 
 def requeued(number: int) -> str:
@@ -32,4 +33,4 @@ def requeued(number: int) -> str:
     if asked.returncode:
         said = " ".join(asked.stderr.split()) or f"exit code {asked.returncode}"
         return f"scontrol requeue {job} failed ({said})"
-    return f"job {job} is in the queue again"
+    return f"job {job} {QUEUED}"

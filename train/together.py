@@ -92,7 +92,7 @@ class Together(_SubprocessScriptLauncher):
                 while len(os.listdir(folder)) < len(self.procs):
                     if (lost := self.lost()) is not None:
                         raise lost
-                    self.received.stop("no step was made yet")
+                    self.received.stop()
                     time.sleep(_EVERY_S)
             finally:
                 del os.environ[_STARTED_BY]

@@ -28,6 +28,7 @@ from lightdepth.camera.foreign import (
     omni_bend,
     radial_bend,
 )
+from lightdepth.counting import with_article
 from lightdepth.errors import InputError
 from lightdepth.files.text import to_numbers
 
@@ -118,7 +119,7 @@ def _kalibr(fields: Fields, chain: Sequence[str], where: str) -> CameraModel:
     elif model == "omni":
         bend = omni_bend(own[0], terms or [0.0] * 4)
     elif any(terms):
-        raise InputError(where, f"{model} with {bent}", f"expected no distortion behind a {model} lens")
+        raise InputError(where, f"{model} with {bent}", f"expected no distortion behind {with_article(model)} lens")
     elif model == "eucm":
         return camera_from_params("EUCM", width, height, [*focal, *own], where).with_pixel_center(0.0)
     else:

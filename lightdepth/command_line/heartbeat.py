@@ -41,7 +41,13 @@ def is_counted() -> bool:
     return bool(_activities)
 
 
-_REASON = " (the first runs on a machine compile loops)"
+_compiled_now: set[int] = set()
+_REASON = " (it compiles loops, which are kept for the next runs on this machine)"
+
+
+def compiles(loop: int, begins: bool) -> None:
+    """Notes that machine code of a loop begins to be made, or that it is there; `loop` is any number of its own."""
+    (_compiled_now.add if begins else _compiled_now.discard)(loop)
 
 
 class Heartbeat:
@@ -52,6 +58,7 @@ class Heartbeat:
         self._verb, self._heard, self._say = verb, heard, say
         self._stage, self._since = "", self._start
         self._begun, self._own = False, self._start  # whether the verb said anything itself; when this one spoke last
+        self._reasoned = False
 
     def stage(self, said: str) -> None:
         """A line of the log: what is done from now on."""
@@ -70,7 +77,9 @@ class Heartbeat:
             if self._stage:
                 line += f", {duration(now - self._since)} since: {self._stage}"
             elif not self._begun:
-                line += ", still starting" + ("" if self._own > self._start else _REASON)  # once
+                line += ", still starting"
+            if _compiled_now and not self._reasoned:
+                line, self._reasoned = line + _REASON, True  # once
         else:
             line = _activities[-1](now)
         if line:

@@ -22,6 +22,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import join
 from typing import Any, TextIO
 
 from lightdepth.command_line.dry import Planned
@@ -32,6 +33,7 @@ from lightdepth.errors import Interrupted, WrongUsage
 from lightdepth.foreign_text import for_line, for_terminal
 
 QUIET, JSON = "--quiet", "--json"
+RESUMES = "--resume goes on"
 SAID_OF = {
     "quiet": "Say nothing but errors, warnings, and what was written where; log.txt has all of it.",
     "json": "Print the result as one JSON document on standard output, and nothing else there.",
@@ -50,6 +52,8 @@ class Outcome:
     quiet: bool = False
     json: bool = False
     verb: str = ""
+    words: Sequence[str] = ()
+    """of the command line"""
     version: str = ""
     """of the program"""
     out: TextIO | None = None
@@ -64,8 +68,10 @@ class Outcome:
     finished_before: bool = False
     stage: Callable[[str], None] = lambda said: None
     """is told the lines of a log"""
-    goes_on: str = "--resume goes on"
+    goes_on: str = RESUMES
     """how a run whose finished parts are kept goes on, in words; empty where none does"""
+    again: str = ""
+    """the command line by which it does, where it did not end"""
     record: Mapping[str, Any] | None = None
     """the last run.json that was written, of a folder that may not be in its place yet"""
 
@@ -77,6 +83,13 @@ class Outcome:
     def fail(self, where: object, found: object, cure: str = "") -> None:
         """The call ends with an error."""
         self.error = {"where": str(where), "found": str(found), "cure": cure}
+
+    def keeping(self, kept: str) -> str:
+        """What is said at the end of a run that was stopped: what is `kept` of it, and how it goes on. Empty where it
+        does not go on. With --resume, the command line is told behind it."""
+        if self.words and self.goes_on == RESUMES:
+            self.again = resuming(self.words)
+        return f"{kept}: {self.goes_on}" if self.goes_on else ""
 
     def made(self, output: Path, said: Sequence[str] = ()) -> None:
         """The run folder whose run.json was written last is in its place. `said`: its warnings, as they were told."""
@@ -103,7 +116,7 @@ class Outcome:
     def document(self, code: int, seconds: float) -> str:
         """All of it, as --json prints it."""
         said: dict[str, Any] = {"verb": self.verb, "exit_code": code, "version": self.version}
-        said |= {"output": self.output, "files": self.files, "next": self.then, "result": self.result}
+        said |= {"output": self.output, "files": self.files, "next": self.then or self.again, "result": self.result}
         said |= {"warnings": self.warnings, "failures": self.failures, "seconds": round(seconds, 3)}
         if self.finished_before:
             said["finished_before"] = True
@@ -154,6 +167,19 @@ def end(
         call.last("written: nothing")
 
 
+def resuming(words: Sequence[str]) -> str:
+    """The command line that goes on with the run of another one, whose words these are."""
+    kept = [word for word in words if not _means(word, "--overwrite")]
+    if not any(_means(word, "--resume") for word in kept):
+        kept.insert(kept.index("--") if "--" in kept else len(kept), "--resume")
+    return join(["lightdepth", *kept])
+
+
+def _means(word: str, option: str) -> bool:
+    """Whether it is an option, or enough of its beginning."""
+    return len(word) > 3 and option.startswith(word)
+
+
 def planned(plan: Planned) -> None:
     """The last lines of a dry run."""
     call = outcome()
@@ -168,7 +194,8 @@ def manners(words: Sequence[str]) -> tuple[Outcome, list[str]]:
     asked = any(word.replace("-", "_").partition("=")[0] in _SPELLED for word in words)
     rest = [word for word in words if word not in (QUIET, JSON)]
     working = bool(rest) and not asked  # help, version and the configuration are what was asked for, whatever the words
-    return Outcome(QUIET in words and working, JSON in words and not asked, rest[0] if rest else ""), rest
+    quiet, as_json = QUIET in words and working, JSON in words and not asked
+    return Outcome(quiet, as_json, rest[0] if rest else "", tuple(words)), rest
 
 
 _TURN = threading.RLock()
@@ -201,6 +228,8 @@ def speaking(call: Outcome) -> Iterator[list[int]]:
         raise
     except BaseException as error:
         call.fail(call.verb, f"{type(error).__name__}: {error}", "this is a fault of the program: please report it")
+        if call.again:
+            error.add_note(f"next: {for_line(call.again)}")
         raise
     finally:
         OUTCOME.reset(token)

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole, camera_from_params
+from lightdepth.counting import with_article
 from lightdepth.datasets.format import Format, frames_of, poses_or_why
 from lightdepth.datasets.sequence import FrameSequence, list_images, numbered_files
 from lightdepth.errors import InputError
@@ -110,7 +111,7 @@ def write_endoslam(frames: Sequence[Frame], path: Path, simulated: bool = False)
         )
     camera = frames[0].camera
     if not isinstance(camera, Pinhole):
-        raise InputError(path, f"a {camera.name} camera", "convert it: the files hold a PINHOLE alone")
+        raise InputError(path, f"{with_article(camera.name)} camera", "convert it: the files hold a PINHOLE alone")
     folder, poses = (path, path) if simulated else (path / "Frames", path / "Poses")
     for made in (folder, poses):
         made.mkdir(parents=True, exist_ok=True)

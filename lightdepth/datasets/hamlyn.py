@@ -19,6 +19,7 @@ import numpy as np
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole
+from lightdepth.counting import with_article
 from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of
 from lightdepth.datasets.sequence import FrameSequence, numbered_files
 from lightdepth.errors import InputError
@@ -101,7 +102,9 @@ def write_hamlyn(frames: Sequence[Frame], path: Path, tree: str = "rectified") -
         raise InputError(path, "no frames to write", "expected at least one")
     camera, where = frames[0].camera, _TREES[tree]
     if not isinstance(camera, Pinhole):
-        raise InputError(path, f"a {camera.name} camera", "convert it: intrinsics.txt holds a PINHOLE alone")
+        raise InputError(
+            path, f"{with_article(camera.name)} camera", "convert it: intrinsics.txt holds a PINHOLE alone"
+        )
     for folder in (where.colour, where.depth):
         (path / folder).mkdir(parents=True)
     for frame in frames:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from lightdepth.calibration import read_camera
 from lightdepth.camera import CameraModel, Pinhole
+from lightdepth.counting import with_article
 from lightdepth.datasets.format import DepthCode, Format, checked_images, frames_of, poses_or_why
 from lightdepth.datasets.sequence import FrameSequence, numbered_files
 from lightdepth.errors import InputError
@@ -100,7 +101,7 @@ def write_simcol(frames: Sequence[Frame], path: Path) -> None:
         )
     camera = frames[0].camera
     if not isinstance(camera, Pinhole):
-        raise InputError(path, f"a {camera.name} camera", "convert it: cam.txt holds a PINHOLE alone")
+        raise InputError(path, f"{with_article(camera.name)} camera", "convert it: cam.txt holds a PINHOLE alone")
     path.mkdir(parents=True)
     positions, quaternions = [], []
     for frame in frames:

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from lightdepth.counting import with_article
 from lightdepth.errors import InputError
 from lightdepth.files.arrays import array_in
 from lightdepth.files.headers import Header, as_stored, header_in, header_of, what_is_there
@@ -85,7 +86,7 @@ def read_bytes(path: Path, what: str = "file") -> bytes:
         if path.exists():
             raise InputError(path, what_is_there(path), f"expected the {what} itself")
         raise InputError(path, f"no such {what}", "correct its name, or put it there")
-    with reading(path, f"a {what}"):
+    with reading(path, with_article(what)):
         check_bytes(path.stat().st_size, _MOST_BYTES, path, what)
         return path.read_bytes()
 

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
+from lightdepth.counting import with_article
 from lightdepth.errors import InputError, MachineFailure
 from lightdepth.files.machine import FAILS
 
@@ -82,7 +83,7 @@ def check_pixels(width: int, height: int, where: str | Path) -> None:
 def check_bytes(size: int, most: int, where: str | Path, what: str = "file") -> None:
     """Raises InputError where a file of `what` is too large to be one."""
     if size > most:
-        raise InputError(where, f"{size} bytes", f"expected a {what} of at most {most} bytes")
+        raise InputError(where, f"{size} bytes", f"expected {with_article(what)} of at most {most} bytes")
 
 
 def brief(number: int) -> str:

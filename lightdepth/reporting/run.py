@@ -385,8 +385,8 @@ def kept_or_gone(run: Run, output: Path, resumable: bool) -> Iterator[None]:
         yield
     except BaseException as error:
         kept = bool(resumable and run.parts and not isinstance(error, InputError))
-        said = f"{kept_parts(run.parts or {})}: {how}" if (how := outcome().goes_on) and kept else ""
-        none = f"Nothing of it is kept; {output.name} is as it was" if how else ""
+        said = outcome().keeping(kept_parts(run.parts or {})) if kept else ""
+        none = f"Nothing of it is kept; {output.name} is as it was" if outcome().goes_on else ""
         failure = machine_failure(error, run.folder, said or none, output)
         if not kept:
             with finishing_first():

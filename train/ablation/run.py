@@ -9,7 +9,7 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -18,7 +18,8 @@ from jsonargparse import ArgumentParser
 
 from lightdepth.checkpoint import load_model
 from lightdepth.command_line.outcome import is_quiet, outcome
-from lightdepth.errors import PartialFailure
+from lightdepth.errors import Interrupted, PartialFailure
+from lightdepth.files.machine import machine_failure
 from lightdepth.files.writing import write_whole
 from lightdepth.foreign_text import for_line
 from lightdepth.models import NetworkModel
@@ -31,6 +32,8 @@ from ..parser import as_yaml
 from .judge import Judge
 from .plan import Plan
 from .table import Result
+
+_KEPT = "inished trainings are kept: the same command goes on"  # behind a small letter or a capital one
 
 
 def finished(plan: Plan) -> Result | None:
@@ -45,7 +48,7 @@ def finished(plan: Plan) -> Result | None:
 def train_all(parser: ArgumentParser, todo: Sequence[Plan], judge: Judge) -> None:
     started, steps = time.monotonic(), sum(plan.config.trainer.max_steps for plan in todo)
     done, seed, rendered = 0, None, list[FrameDataModule]()
-    with Progress("Steps of training", steps) as bar:
+    with _kept(), Progress("Steps of training", steps) as bar:
         for number, plan in enumerate(todo, 1):
             if plan.seed != seed:
                 seed, rendered = plan.seed, []
@@ -57,6 +60,24 @@ def train_all(parser: ArgumentParser, todo: Sequence[Plan], judge: Judge) -> Non
             said = result.failed or f"{result.overall():.3f} of the closed form's errors"
             what = f"[{number}/{len(todo)}] seed {plan.seed}, {plan.row.name}"
             say(f"{what}: {said}, {result.seconds:.0f} s; {left:.0f} min left")
+
+
+@contextlib.contextmanager
+def _kept() -> Iterator[None]:
+    """What a signal or the machine ends within it is told with how the ablation goes on, not a training of it."""
+    call = outcome()
+    call.goes_on, before = "", call.goes_on
+    try:
+        yield
+    except Interrupted as error:
+        error.kept = f"f{_KEPT}"
+        raise
+    except Exception as error:
+        if (failure := machine_failure(error, kept=f"F{_KEPT}")) is None:
+            raise
+        raise failure from error
+    finally:
+        call.goes_on = before
 
 
 def _reach(bar: Progress, before: int, step: int) -> None:
