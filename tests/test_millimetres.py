@@ -178,6 +178,15 @@ def test_the_light_s_offset_tells_the_millimetres_of_a_map_unit(looks):
     assert low < 2.0 < high and low * high == pytest.approx(found.mm_per_unit**2)
 
 
+def test_an_interval_is_wider_the_more_light_may_come_from_wall_that_no_look_shows(looks, monkeypatch):
+    monkeypatch.setattr(room, "_FINE", ((0.3,), (0.5,)))
+    wide = millimetres(looks, LIGHT, near=2.5)
+    monkeypatch.setattr(room, "_BETWEEN", 0.0)
+    narrow = millimetres(looks, LIGHT, near=2.5)
+    assert wide.reflectance == 0.3 and wide.mm_per_unit == narrow.mm_per_unit
+    assert wide.deviation**2 - narrow.deviation**2 == pytest.approx((0.28 * 0.3) ** 2)
+
+
 def test_a_search_that_ends_where_its_finer_scales_end_goes_on_from_there(looks, monkeypatch):
     right = millimetres(looks, LIGHT, near=2.5)
     monkeypatch.setattr(room, "_profiles", misled := Misled(room._profiles))

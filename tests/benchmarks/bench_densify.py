@@ -47,7 +47,7 @@ DROPPED = {
     "no bending": replace(FULL, bending=BendingConfig(on=False)),
     "no overlap": replace(FULL, agreement=AgreementConfig(overlap=0)),
     "contradicted pixels kept": replace(FULL, contradiction=ContradictionConfig(on=False)),
-    "grazing pixels and edges kept": replace(FULL, rectify=RectifyConfig(max_slope=np.inf)),
+    "grazing pixels and edges kept": replace(FULL, rectify=RectifyConfig(max_slope=1e9)),
 }
 MEASURES = {"median": "median mm", "rms": "RMS mm", "truth": "truth to surface mm", "hidden": "hidden blocks %"}
 
