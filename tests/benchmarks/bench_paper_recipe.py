@@ -177,6 +177,7 @@ def test_a_mesh_after_every_keyframe(colon):
     )
     plain, mesh = plainly(colon, LIVE_FUSION, every=True)
     reference = told("plain", plain.times, len(submap.keyframes))
+    play(frames, found, predict, LiveConfig(agreement=RIGID, judge=AheadConfig(on=False)), lambda surface: None)  # warm
     for name, config in (
         ("live, one scale each", LiveConfig(agreement=RIGID, judge=AheadConfig(on=False))),
         ("live, bent, not judged", LiveConfig(judge=AheadConfig(on=False))),
