@@ -99,20 +99,23 @@ class Bend(Brief):
     def with_finer(self) -> Bend:
         """The same field, with the finer grid among its bumps, which adds nothing yet."""
         before = len(self.weights) - self._in_layers
-        weights = np.insert(self.weights, before, np.zeros(self.config.finer**2))
+        more = np.zeros(self.config.finer**2 if self.config.on else 0)
+        weights = np.insert(self.weights, before, more)
         return replace(self, config=self.config.with_finer(), weights=weights)
 
     @property
     def scale(self) -> float:
         """Map units per predicted unit at the median distance, in the mean over the image."""
+        if not self.config.on:
+            return float(np.exp(self.weights[0]))
         middle, first = np.array([self.log_middle]), len(self.weights) - self._in_layers
         layers = [self.weights[first + k] * self._layer(middle, k)[0] for k in range(self.config.layers)]
-        return float(np.exp(self.weights[0] + sum(layers if self.config.on else [])))
+        return float(np.exp(self.weights[0] + sum(layers)))
 
     @property
     def _in_layers(self) -> int:
         """How many of the weights, the last ones, are those of layers."""
-        return self.config.layers * (1 + self.config.columns**2)
+        return self.config.layers * (1 + self.config.columns**2) if self.config.on else 0
 
     def basis(self, x: np.ndarray, log_distance: np.ndarray) -> np.ndarray:
         """phi (n, m) at x (n, 2) in [0, 1]² and log predicted distance (n,)."""

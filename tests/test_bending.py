@@ -58,6 +58,9 @@ def test_off_it_is_one_scale():
     assert config.precision.tolist() == [0]
     np.testing.assert_allclose(bend.applied(prediction()).distance, 0.5 * prediction().distance, rtol=1e-6)
     assert bend.at(np.zeros((3, 2)), np.ones(3)) == pytest.approx(np.log([0.5] * 3))
+    assert bend.scale == pytest.approx(0.5)
+    finer = bend.with_finer()
+    assert finer.scale == pytest.approx(0.5) and finer.weights.tolist() == bend.weights.tolist()
 
 
 def test_invalid_pixels_do_not_matter():
