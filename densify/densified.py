@@ -103,7 +103,7 @@ class Densified:
         if self.scales is None:
             return ""
         if not self.scales.all_told:
-            return "the surfaces are in map units, as the light tells no millimetres"
+            return "the surfaces are in map units, as the light does not tell every map's millimetres"
         reach = max(one.reach for one in self.scales.maps) - 1
         return (
             f"the colour says nothing about the millimetres, which the light gave: nine of ten are within {reach:.0%}"
@@ -115,9 +115,9 @@ class Densified:
         if self.scales is None or self.scales.all_told:
             return ""
         refused = [one for one in self.scales.maps if one.mm_per_unit is None]
-        maps = ", ".join(str(one.map) for one in refused)
-        why = "".join(f" of map {maps}: {one.refused}; {one.cure}" for one in refused[:1])
-        return f"the surfaces are in map units: the light tells no millimetres{why}"
+        others = f" (and of {counted(len(refused) - 1, 'other')})" if len(refused) > 1 else ""
+        why = "".join(f"; of map {one.map}{others}: {one.refused}; {one.cure}" for one in refused[:1])
+        return f"the surfaces are in map units: the light does not tell every map's millimetres{why}"
 
     @property
     def verdict(self) -> Verdict | None:

@@ -145,8 +145,8 @@ def _told(verb: str, error: Exception | str, code: int) -> int:
 
 def _say_next(call: Outcome) -> None:
     """The command line that goes on with what is kept of a run which did not end."""
-    if call.again:
-        _say(f"next: {call.again}", flush=True)
+    if call.again is not None:
+        _say(f"next: {call.again.said(sys.stderr)}", flush=True)
 
 
 def _is_lost(verb: str) -> bool:

@@ -261,7 +261,8 @@ def test_where_the_light_tells_no_millimetres_surfaces_stay_in_map_units_and_why
     said = capsys.readouterr().out
     assert "warning: map 0: no millimetres, nobody gave the light" in said and "mm per map unit" not in said
     last = said.splitlines()[-3]  # what to type next, and what was written, come after it
-    assert last.startswith("the surfaces are in map units: the light tells no millimetres of map 0, 1: nobody gave the")
+    why = "the light does not tell every map's millimetres; of map 0 (and of 1 other): nobody gave the light: "
+    assert last.startswith(f"the surfaces are in map units: {why}")
     assert last.endswith("give it: --light light.json, with position_mm and a source other than assumed")
     record = json.loads((tmp_path / "dense" / "run.json").read_text())
     assert record["unit"] == "map units" and any("nobody gave the light" in w for w in record["warnings"])

@@ -13,9 +13,10 @@ import pytest
 from colons import colon, slam
 
 from lightdepth.cli import main
-from lightdepth.command_line.following import PLACES, Input, command
+from lightdepth.command_line.following import PLACES, Input, command, given
 from lightdepth.command_line.outcome import end
 from lightdepth.datasets import SequenceSource
+from lightdepth.detective import PairingConfig
 from lightdepth.tube.export import write_synthetic
 
 
@@ -26,8 +27,19 @@ class Terminal(io.StringIO):
 
 def test_a_command_has_names_for_a_terminal_and_words_elsewhere():
     said = command("measure", Input("RUN", Path("a run")), options={"--points": PLACES, "-o": Path("my lengths.json")})
-    assert said.said(to_terminal=False) == f"lightdepth measure RUN --points '{PLACES}' -o 'my lengths.json'"
-    assert said.said(to_terminal=True) == f"lightdepth measure 'a run' --points '{PLACES}' -o 'my lengths.json'"
+    assert said.said(io.StringIO()) == f"lightdepth measure RUN --points '{PLACES}' -o 'my lengths.json'"
+    assert said.said(Terminal()) == f"lightdepth measure 'a run' --points '{PLACES}' -o 'my lengths.json'"
+
+
+def test_a_name_like_an_option_stays_a_name_and_one_that_cannot_be_shown_is_not():
+    assert command("view", Input("RUN", Path("-x"))).named == "lightdepth view ./-x"
+    hidden = command("view", Input("RUN", Path("a\u200fb")))
+    assert hidden.said(Terminal()) == "lightdepth view RUN"
+
+
+def test_settings_that_are_as_usual_are_not_said():
+    assert given(PairingConfig()) == {}
+    assert given(PairingConfig(map_fps=25.0, trust_map=True)) == {"--map-fps": "25.0", "--trust-map": "true"}
 
 
 def test_what_was_not_given_is_not_said():
@@ -48,7 +60,7 @@ def test_only_a_terminal_is_told_the_names(stream, name, monkeypatch):
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
-    place = tmp_path_factory.mktemp("following") / "two words"
+    place = tmp_path_factory.mktemp("following") / "Doe, John: 1"
     frames = colon(0, 8).frames
     write_synthetic(frames, slam(frames), place)
     return place

@@ -14,9 +14,19 @@ from training import TINY_RUN, write_sequence
 
 import train.fit as fit_module
 from lightdepth.cli import main
+from lightdepth.command_line import following
 from lightdepth.command_line.outcome import resuming
+from lightdepth.errors import Interrupted
 from lightdepth.reporting import batches
 from lightdepth.reporting.run import Run
+from train.ablation.run import _kept as kept_by_rows
+
+
+@pytest.fixture(autouse=True)
+def before_a_terminal(monkeypatch, request):
+    """Somebody sits before it: logs and pipes are told no names."""
+    monkeypatch.setattr(following, "on_terminal", lambda stream: "in_a_log" not in request.node.name)
+
 
 CHEAP = [*TINY_RUN, "--trainer.max-steps", "3", "--trainer.logger", "none"]
 
@@ -132,9 +142,18 @@ def test_a_prediction_that_is_stopped_says_the_command_that_goes_on_and_that_com
     then = said.err.splitlines()[-1]
     assert typed(then) == [*words, "--resume"]
     if "--json" in manner:
-        assert f"next: {json.loads(said.out)['next']}" == then
+        assert json.loads(said.out)["next"] == "the same command with --resume"  # a program is told no names
     assert main(typed(then)) == 0
     assert (tmp_path / "out" / "run.json").is_file()
+
+
+def test_an_ablation_that_is_in_the_queue_again_says_so():
+    error = Interrupted(signal.SIGUSR1, "step 3 is kept. job 17 is in the queue again")
+    with (
+        pytest.raises(Interrupted, match=r"finished trainings are kept\. job 17 is in the queue again$"),
+        kept_by_rows(),
+    ):
+        raise error
 
 
 def test_an_ablation_that_is_stopped_goes_on_by_its_own_command_and_has_no_other(tmp_path, stopped_at, capsys):
@@ -163,4 +182,12 @@ def test_an_ablation_that_is_stopped_goes_on_by_its_own_command_and_has_no_other
     ],
 )
 def test_the_command_that_goes_on_is_the_one_that_was_typed_with_resume_in_the_place_of_overwrite(words, line):
-    assert resuming(words) == f"lightdepth {line}"
+    assert resuming(words).named == f"lightdepth {line}"
+
+
+def test_in_a_log_the_command_that_goes_on_has_no_names(tmp_path, stopped_in_part, capfd):
+    data = write_sequence(tmp_path / "Doe", 3)
+    assert main(["predict", str(data), "--checkpoint", "decline", "-o", str(tmp_path / "out")]) == 128 + signal.SIGTERM
+    said = capfd.readouterr().err
+    assert said.splitlines()[-1] == "next: the same command with --resume" and "Doe" not in said
+    assert resuming(["predict", "--overwrite"]).anonymous.endswith("--resume in the place of --overwrite")

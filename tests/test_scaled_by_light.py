@@ -51,9 +51,9 @@ def test_where_one_map_is_refused_all_surfaces_stay_in_map_units(tmp_path, monke
     scales = Scales((MapScale(0, 2.0, (1.6, 2.5), "the light"), MapScale(1, refused="it is dark", cure="more light")))
     work, record = densified_in(tmp_path / "run", scales, monkeypatch)
     assert record["unit"] == "map units"
-    assert work.of_millimetres == "the surfaces are in map units, as the light tells no millimetres"
-    why = "the surfaces are in map units: the light tells no millimetres of map 1: it is dark; more light"
-    assert work.without_millimetres == why
+    assert work.of_millimetres == "the surfaces are in map units, as the light does not tell every map's millimetres"
+    why = "the light does not tell every map's millimetres; of map 1: it is dark; more light"
+    assert work.without_millimetres == f"the surfaces are in map units: {why}"
     np.testing.assert_allclose(np.abs(trimesh.load(tmp_path / "run" / "map_000" / "mesh.ply").bounds), 10, rtol=0.01)
     said = capsys.readouterr().out
     assert "warning: map 1: no millimetres, it is dark; more light" in said
@@ -67,7 +67,7 @@ def test_the_verdict_says_that_surfaces_are_in_map_units_where_millimetres_were_
     )
     assert asked.verdict is not None
     for said in (asked.headline, asked.verdict.sentence):
-        assert said.endswith("; the surfaces are in map units, as the light tells no millimetres")
+        assert said.endswith("; the surfaces are in map units, as the light does not tell every map's millimetres")
     assert "map units" not in Densified("truth", [result], gallery).headline
 
 

@@ -106,7 +106,7 @@ def fit(
         asked = requeued(error.signal)
         error.kept = ". ".join(filter(None, (_left(output, resume or overwrite, error.kept), asked)))
         if asked.endswith(QUEUED) or not first_process():
-            outcome().again = ""
+            outcome().again = None
         raise
 
 
@@ -301,8 +301,10 @@ def _left(output: Path, flagged: bool, kept: str) -> str:
     """What is left of a run that was stopped, and how to go on; `kept` is what its steps say of it."""
     if has_checkpoint(unfinished_path(output.resolve())) or (has_checkpoint(output) and read_record(output) is None):
         return outcome().keeping(kept or "its checkpoints are kept")
-    none = f"{output.name} is as it was: the same command" if flagged else "nothing is kept: the same command"
-    return f"no step was made yet, so {none} starts anew"
+    if flagged and has_checkpoint(output):
+        return f"no step was made yet, so {output.name} is as it was: the same command goes on"
+    none = f"{output.name} is as it was" if flagged else "nothing is kept"
+    return f"no step was made yet, so {none}: the same command starts anew"
 
 
 @contextmanager

@@ -151,7 +151,9 @@ def _kept_or_gone(folder: Path, output: Path, hidden: bool) -> Iterator[None]:
         named = str(getattr(error, "filename", ""))
         begun = folder.is_dir() or (isinstance(error, FileNotFoundError) and Path(named).is_relative_to(folder))
         resumable = kept and not isinstance(error, InputError | PartialFailure)
-        left = outcome().keeping("Its checkpoints are kept") if resumable else "Nothing of it is kept"
+        left = outcome().keeping("Its checkpoints are kept") if resumable else ""
+        if not resumable and outcome().goes_on:  # else who called says what is kept
+            left = "Nothing of it is kept"
         failure = machine_failure(error, folder if begun else None, left, output)
         if not kept and hidden:
             discard(folder)

@@ -2,7 +2,8 @@
 
 RUN/.state/colons/<of>/<seed>.safetensors, one for each colon, and <hash>.safetensors, the rays that they share. `of` is
 a hash of all that they are rendered from: the settings, the seed of the data, the size, and the code. They are the same
-to the bit as what was rendered, and go with `.state` when the run is whole: they take as much as the training's memory.
+to the bit as what was rendered, and go with `.state` when the run is whole: they take
+as much room as the colons in memory do, and at most MOST bytes.
 """
 
 from __future__ import annotations

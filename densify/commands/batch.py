@@ -17,8 +17,9 @@ from densify.dense_run import Asked
 from densify.inputs import MapSource, SurfaceFiles
 from densify.joining import MergeConfig
 from lightdepth.checkpoint import ModelSource
+from lightdepth.command_line.following import on_terminal
 from lightdepth.command_line.options import Group
-from lightdepth.command_line.outcome import end
+from lightdepth.command_line.outcome import end, outcome
 from lightdepth.counting import counted, full_stop
 from lightdepth.datasets import SequenceSource
 from lightdepth.errors import PartialFailure
@@ -87,9 +88,11 @@ def batch(
     settings = recorded(source, predicting, config, files, sfm=sfm, fit_light=fit_light, merge=merge, merging=merging)
     arguments = {**settings, **vars(mapped), "map": inside, "data": None}
     same = [f"The manifest repeats {counted(len(rows) - len(units), 'row')}."] * (len(rows) > len(units))
-    if copies := said_of_copies(units, lambda unit: str(unit.row.data)):
-        print(for_line(f"warning: {copies}"), file=sys.stderr, flush=True)
-        same.append(full_stop(said_of_copies(units, lambda unit: unit.name)))  # files name no paths
+    if copies := said_of_copies(units, lambda unit: unit.name):  # logs and files name no paths
+        named = said_of_copies(units, lambda unit: str(unit.row.data)) if on_terminal(sys.stderr) else copies
+        print(for_line(f"warning: {named}"), file=sys.stderr, flush=True)
+        outcome().warned(full_stop(copies))
+        same.append(full_stop(copies))
     work = Batch(units, place, Maker(predicting, place, KEPT.get()), arguments, same)
     lines = batch_run(work, running)
     if failures := told_failures(lines):

@@ -58,7 +58,8 @@ def view(
     viewing = Viewing.of(run, data, mm_per_unit, triangles)
     with finishing_first() as received:
         viewing.serve(host, port, received)
-        then = command("measure", Input("RUN", run), options={"--points": PLACES, "-o": "lengths.json"})
+        unit = {} if mm_per_unit is None else {"--mm-per-unit": f"{mm_per_unit:g}"}
+        then = command("measure", Input("RUN", run), options={**unit, "--points": PLACES, "-o": "lengths.json"})
         end(then=then, result=viewing.result)
         received.stop("nothing was written")
 

@@ -70,7 +70,7 @@ class Outcome:
     """is told the lines of a log"""
     goes_on: str = RESUMES
     """how a run whose finished parts are kept goes on, in words; empty where none does"""
-    again: str = ""
+    again: Following | None = None
     """the command line by which it does, where it did not end"""
     record: Mapping[str, Any] | None = None
     """the last run.json that was written, of a folder that may not be in its place yet"""
@@ -116,7 +116,8 @@ class Outcome:
     def document(self, code: int, seconds: float) -> str:
         """All of it, as --json prints it."""
         said: dict[str, Any] = {"verb": self.verb, "exit_code": code, "version": self.version}
-        said |= {"output": self.output, "files": self.files, "next": self.then or self.again, "result": self.result}
+        then = self.then or (self.again.anonymous if self.again is not None else "")
+        said |= {"output": self.output, "files": self.files, "next": then, "result": self.result}
         said |= {"warnings": self.warnings, "failures": self.failures, "seconds": round(seconds, 3)}
         if self.finished_before:
             said["finished_before"] = True
@@ -158,7 +159,7 @@ def end(
     for doubt in doubts:
         call.warned(doubt)
     if not call.quiet:
-        said = then if isinstance(then, str) else then.said(to_terminal=sys.stdout.isatty())
+        said = then if isinstance(then, str) else then.said(sys.stdout)
         print(f"next: {for_line(said)}", flush=True)
     opened = f"; open {for_line(str(page))}" if page is not None else ""
     if written:
@@ -167,12 +168,14 @@ def end(
         call.last("written: nothing")
 
 
-def resuming(words: Sequence[str]) -> str:
-    """The command line that goes on with the run of another one, whose words these are."""
+def resuming(words: Sequence[str]) -> Following:
+    """The command line that goes on with the run of another one, whose words these are: inputs are among them."""
+    there = any(_means(word, "--overwrite") for word in words)
+    place = " in the place of --overwrite" if there else ""
     kept = [word for word in words if not _means(word, "--overwrite")]
     if not any(_means(word, "--resume") for word in kept):
         kept.insert(kept.index("--") if "--" in kept else len(kept), "--resume")
-    return join(["lightdepth", *kept])
+    return Following(f"the same command with --resume{place}", join(["lightdepth", *kept]))
 
 
 def _means(word: str, option: str) -> bool:
@@ -228,8 +231,8 @@ def speaking(call: Outcome) -> Iterator[list[int]]:
         raise
     except BaseException as error:
         call.fail(call.verb, f"{type(error).__name__}: {error}", "this is a fault of the program: please report it")
-        if call.again:
-            error.add_note(f"next: {for_line(call.again)}")
+        if call.again is not None:
+            error.add_note(f"next: {call.again.said(sys.stderr)}")
         raise
     finally:
         OUTCOME.reset(token)

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from lightdepth.calibration import write_light
-from lightdepth.command_line.following import Input, command
+from lightdepth.command_line.following import Input, command, given
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
 from lightdepth.datasets import FormatName, SequenceSource
@@ -87,7 +87,8 @@ def calibrate_light(
     print(f"light: {found.said}")
     of_wall = sought.position is None  # of a board, the frames of the wall are others
     read_as = source.typed() if of_wall else {"--camera": Input("CAMERA", camera)}
-    options = {"--map": Input("MAP", map), **read_as, "--light": output, "-o": "runs/dense"}
+    pairs = given(pairing) if map is not None else {}
+    options = {"--map": Input("MAP", map), **pairs, **read_as, "--light": output, "-o": "runs/dense"}
     then = command("densify", Input("DATA", data) if of_wall else "DATA", options=options)
     result = {"light": plain(found.light), **found.more, "said": found.said}
     end(output, page_path, then=then, page=page_path, result=result)

@@ -29,6 +29,7 @@ from lightdepth.reporting.run import plain
 from ..datamodule import FrameDataModule
 from ..fit import fit
 from ..parser import as_yaml
+from ..requeue import QUEUED
 from .judge import Judge
 from .plan import Plan
 from .table import Result
@@ -70,7 +71,8 @@ def _kept() -> Iterator[None]:
     try:
         yield
     except Interrupted as error:
-        error.kept = f"f{_KEPT}"
+        asked = error.kept.rpartition(". ")[2] if error.kept.endswith(QUEUED) else ""
+        error.kept = f"finished trainings are kept. {asked}" if asked else f"f{_KEPT}"
         raise
     except Exception as error:
         if (failure := machine_failure(error, kept=f"F{_KEPT}")) is None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from safetensors.torch import load_file, save_file
 
 from lightdepth.checkpoint import DEFAULT_CHECKPOINT, load_called, save_model
-from lightdepth.command_line.following import Input, Value, command
+from lightdepth.command_line.following import Input, Value, command, given
 from lightdepth.command_line.options import Group
 from lightdepth.command_line.outcome import end
 from lightdepth.counting import counted
@@ -137,7 +137,8 @@ def adapt(
         made.write(run.folder / "report.html")
         _record(run, start, target, module, data, config, outcome)
     own: dict[str, Value] = {"--checkpoint": output / "model.safetensors", "-o": "runs/own"}
-    then = command("densify", Input("DATA", source.data), options={"--map": Input("MAP", map), **source.typed(), **own})
+    read_as = {"--map": Input("MAP", map), **given(pairing), **source.typed()}
+    then = command("densify", Input("DATA", source.data), options={**read_as, **own})
     end(output, then=then, page=output / "report.html")
 
 

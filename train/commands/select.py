@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import time
 import warnings
 from collections import Counter
@@ -179,7 +180,9 @@ def select(
         if no_frames:
             paths["sheet"].unlink(missing_ok=True)  # that of an earlier run shows other frames
     print(summary)
-    frames_of: dict[str, Value] = {"--data.sequences": Input("'[DATA]'", Path(f"[{data}]")), "--data.frames": output}
+    read_as = SequenceSource(data, format, camera, mask=mask).typed()
+    frames_of: dict[str, Value] = {"--data.sequences": Input("'[DATA]'", json.dumps([str(data)]))}
+    frames_of |= {f"--data.{option[2:]}": value for option, value in read_as.items()} | {"--data.frames": output}
     then = command("train", options={"--preset": "lightdepth", "-o": "runs/self", **frames_of})
     result = {"frames": len(verdicts), "kept": len(chosen), "rejected": dict(_rejected(verdicts))}
     beside = [path for path in writers if path != output]
