@@ -34,6 +34,8 @@ GIVEN, FOUND = "LIGHTDEPTH_SPEED", Path("runs/speed/speed.json")
 """The variable that names a file of measured speeds, and where one is looked for: as `bench speed` writes it."""
 MODEL_STEPS = ("read", "predict")
 """Steps that a dry run tries on the spot: the frames are at hand, and so is the model."""
+_FIRST = 2.5
+"""Seconds, on the machine of the tables, that a process takes to open what meshes and charts are drawn with, once."""
 _LIGHT = 26 * 3
 """Predictions that finding a light on the map takes at the most: keyframes, by as many lights."""
 _Positive = Annotated[float, Field(gt=0, le=1e15, allow_inf_nan=False)]
@@ -156,6 +158,6 @@ def surface_steps(
     if fit_light and frames.first().light.assumed:
         steps.append(Step("finding the light on the map, at the most", times(min(_LIGHT, 3 * count), each)))
     known = known_cost()
-    fused = known.cost.of(count, camera.width * camera.height / 1e6)
+    fused = known.cost.of(count, camera.width * camera.height / 1e6) + _FIRST * slowness()
     steps.append(Step(f"aligning, judging and fusing, {known.by}, {counted(count, 'keyframe')}", fused))
     return steps

@@ -14,6 +14,8 @@ from lightdepth.reporting.plan import Work, slowness
 _COLON_FRAME, _COLON_JUDGED, _COLON_SPOILT = 4.0, 0.3, 8.0
 """Seconds of a frame of the judge's colons, on the machine of the tables: rendered; judged, and spoilt too, by a
 model."""
+_JUDGED = 2.3
+"""How many times longer a keyframe takes whose surface is judged against the truth, in maps as long as these."""
 _COMPLETED = 3.0
 """How many times longer a keyframe takes that is completed in every way than one that is made dense."""
 
@@ -29,7 +31,8 @@ def bench_plan(config: BenchConfig) -> tuple[str, Work]:
     )
     width, height = config.image_size
     made = f"rendering {counted(keyframes, 'keyframe')}, and {fused} made dense, {width}x{height}"
-    return what, lambda: [Step(made, known_cost().cost.of(keyframes + fused, width * height / 1e6, 0))]
+    worth = keyframes + _JUDGED * fused
+    return what, lambda: [Step(made, known_cost().cost.of(worth, width * height / 1e6, 0))]
 
 
 def per_frame_plan(models: int, rendered: bool, spoilt: bool) -> tuple[str, Work]:
