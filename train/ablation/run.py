@@ -34,7 +34,7 @@ from .judge import Judge
 from .plan import Plan
 from .table import Result
 
-_KEPT = "inished trainings are kept: the same command goes on"  # behind a small letter or a capital one
+_KEPT = "finished trainings are kept: the same command goes on"
 
 
 def finished(plan: Plan) -> Result | None:
@@ -72,10 +72,10 @@ def _kept() -> Iterator[None]:
         yield
     except Interrupted as error:
         asked = error.kept.rpartition(". ")[2] if error.kept.endswith(QUEUED) else ""
-        error.kept = f"finished trainings are kept. {asked}" if asked else f"f{_KEPT}"
+        error.kept = f"finished trainings are kept. {asked}" if asked else _KEPT
         raise
     except Exception as error:
-        if (failure := machine_failure(error, kept=f"F{_KEPT}")) is None:
+        if (failure := machine_failure(error, kept=_KEPT.capitalize())) is None:
             raise
         raise failure from error
     finally:
